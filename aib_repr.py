@@ -6,7 +6,7 @@ together, while a KL penalty makes phi keep only what the camera does not show. 
 
 Usage:   python aib_repr.py --env-id InterceptFast-v0
 Reads:   nothing
-Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/ (a .npy memory map per array, meta.json), repr.pt, diagnostics.json
+Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/ (one .npy memory map per array), repr.pt, diagnostics.json
 """
 
 import difflib
@@ -71,8 +71,8 @@ class Args:
 
     num_episodes: int | None = None
     """episodes of the random policy (default: 1000, quick: 16)"""
-    val_share: float = 0.05
-    """share of the episodes held out"""
+    val_share: float | None = None
+    """share of the episodes held out (default: 0.05, quick: 0.25)"""
     epochs: int | None = None
     """passes over the training transitions (default: 200, quick: 2)"""
     batch_size: int = 500
@@ -95,8 +95,8 @@ class Args:
     """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
 
 
-DEFAULTS = dict(robot="panda_wristcam", num_envs=250, num_episodes=1000, epochs=200)
-QUICK = dict(robot="panda", num_envs=16, num_episodes=16, epochs=2)
+DEFAULTS = dict(robot="panda_wristcam", num_envs=250, num_episodes=1000, val_share=0.05, epochs=200)
+QUICK = dict(robot="panda", num_envs=16, num_episodes=16, val_share=0.25, epochs=2)
 
 
 # ---------------------------------------------------------------- run directory and files
@@ -109,7 +109,7 @@ def fail(message: str, code: int = 2) -> NoReturn:
 
 
 def resolve(args: "Args", defaults: dict) -> "Args":
-    """Fill in the arguments left out, so that args.json shows what was used; fails when CUDA is asked for and absent."""
+    """Fill in the arguments left out, so that args.json shows what was used; fails when CUDA is wanted and absent."""
     has_cuda = torch.cuda.is_available()
     if not has_cuda and "cuda" in (args.device or "") + (args.sim_backend or ""):
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu or leave both out")
@@ -168,8 +168,9 @@ def run_directory(args: "Args") -> Iterator[Path]:
     Fails when another process works there, or when it was made with other arguments.
     """
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
-    no_matter = ("overwrite", "checkpoint_minutes", "num_workers")
+    no_matter = ("overwrite", "checkpoint_minutes", "num_workers", "evaluate", "checkpoint")
     wanted = {name: value for name, value in asdict(args).items() if name not in no_matter}
+    wanted = json.loads(json.dumps(wanted, default=str))
     try:
         path.mkdir(parents=True, exist_ok=True)
         lock = os.open(path / "lock", os.O_CREAT | os.O_RDWR)
@@ -193,6 +194,8 @@ def run_directory(args: "Args") -> Iterator[Path]:
         write_file(record, (json.dumps(wanted, indent=2) + "\n").encode())
         yield path
     finally:
+        if {entry.name for entry in path.iterdir()} <= {"lock", "args.json"}:
+            shutil.rmtree(path)  # a run that wrote nothing leaves nothing
         os.close(lock)
 
 
@@ -215,7 +218,7 @@ class StopSignal:
 
 
 def seed_everything(seed: int, *counter: int) -> None:
-    """Seed torch from the run's seed and a counter: what follows depends on them and the weights, so resuming is exact."""
+    """Seed torch from the run's seed and a counter: updates depend on weights and number only, and resume exactly."""
     torch.manual_seed(int(np.random.SeedSequence([seed, *counter]).generate_state(1)[0]))
 
 
@@ -231,50 +234,34 @@ def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]
 # ---------------------------------------------------------------- environments
 
 
-class HiddenObjects(gym.Wrapper):
-    """Let objects hidden by a task come back on the CPU simulator, as they do on the GPU simulator.
-
-    MIKASA hides an object by writing z = 1000 into its pose inside evaluate(). On the GPU this reaches renderer and
-    reward, but not physics. On the CPU it moves the body, so the pose from before is put back before physics goes on.
-    """
-
-    def __init__(self, env: gym.Env):
-        super().__init__(env)
-        self._poses: dict = {}
-        evaluate = env.unwrapped.evaluate
-
-        def evaluate_and_remember() -> dict:
-            self._poses = {actor: actor.pose.raw_pose.clone() for actor in env.unwrapped.scene.actors.values()}
-            return evaluate()
-
-        env.unwrapped.evaluate = evaluate_and_remember
-
-    def _put_back(self) -> None:
-        for actor, pose in self._poses.items():
-            if not torch.equal(actor.pose.raw_pose, pose):
-                actor.pose = pose
-
-    def reset(self, **kwargs: object) -> tuple:
-        """See gym.Env.reset."""
-        self._put_back()
-        return self.env.reset(**kwargs)
-
-    def step(self, action: torch.Tensor) -> tuple:
-        """See gym.Env.step."""
-        self._put_back()
-        return self.env.step(action)
-
-
 class TaskView(gym.Wrapper):
     """Split what a task shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
     Info, privileged: success (B,), state (B, D) without what is observable, cue (B, K), the memory variable itself.
+
+    On the CPU simulator it also lets hidden objects come back. MIKASA hides an object by writing z = 1000 into its pose
+    inside evaluate(). On the GPU this reaches renderer and reward, but not physics. On the CPU it moves the body, so
+    the pose from before is put back before physics goes on.
     """
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
-        env.unwrapped.update_obs_space(self._observation(env.unwrapped._init_raw_obs))
+        task, self._poses = env.unwrapped, {}
+        task.update_obs_space(self._observation(task._init_raw_obs))
+        evaluate = task.evaluate
+
+        def evaluate_and_remember() -> dict:
+            self._poses = {actor: actor.pose.raw_pose.clone() for actor in task.scene.actors.values()}
+            return evaluate()
+
+        if not task.gpu_sim_enabled:
+            task.evaluate = evaluate_and_remember
+
+    def _put_back(self) -> None:
+        for actor, pose in self._poses.items():
+            if not torch.equal(actor.pose.raw_pose, pose):
+                actor.pose = pose
 
     def _observation(self, obs: dict) -> dict:
         return {"rgb": obs["rgb"][..., :3].contiguous(), "joints": obs["state"]}
@@ -297,17 +284,19 @@ class TaskView(gym.Wrapper):
 
     def reset(self, **kwargs: object) -> tuple:
         """See gym.Env.reset."""
+        self._put_back()
         obs, info = self.env.reset(**kwargs)
         return self._observation(obs), self._info(info)
 
     def step(self, action: torch.Tensor) -> tuple:
         """See gym.Env.step."""
+        self._put_back()
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._observation(obs), reward, terminated, truncated, self._info(info)
 
 
 def make_task(args: "Args", num_scenes: int) -> gym.Env:
-    """Build one ManiSkill environment of num_scenes; on physx_cpu num_scenes is 1 and arrays are numpy without batch."""
+    """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
     from mani_skill.utils.wrappers import CPUGymWrapper, FlattenRGBDObservationWrapper
 
@@ -325,7 +314,7 @@ def make_task(args: "Args", num_scenes: int) -> gym.Env:
     if args.sim_backend == "physx_cuda":
         return TaskView(env)
     torch.set_num_threads(1)  # a process per core
-    return CPUGymWrapper(TaskView(HiddenObjects(env)), ignore_terminations=True)
+    return CPUGymWrapper(TaskView(env), ignore_terminations=True)
 
 
 def make_envs(args: "Args", num_episodes: int) -> gym.vector.VectorEnv:
@@ -662,7 +651,9 @@ def score_readout(readout: dict, x: torch.Tensor, y: torch.Tensor) -> float:
     return torch.stack(scores).mean().item() if scores else math.nan
 
 
-def diagnose(phi: StateEncoder, arrays: dict[str, np.ndarray], train: np.ndarray, val: np.ndarray) -> dict[str, float]:
+def diagnose_repr(
+    phi: StateEncoder, arrays: dict[str, np.ndarray], train: np.ndarray, val: np.ndarray
+) -> dict[str, float]:
     """What the mean of u holds: active dimensions (std over 0.1) and linear read-outs of cue and state, held out."""
 
     def rows(episodes: np.ndarray) -> tuple[torch.Tensor, ...]:
@@ -763,7 +754,7 @@ def main(args: Args) -> None:
                     stop.leave(path)
         bar.close()
 
-        report = diagnose(phi, arrays, train, val)
+        report = diagnose_repr(phi, arrays, train, val)
         for name, value in report.items():
             writer.add_scalar(f"diagnostics/{name}", value, update)
         writer.close()
