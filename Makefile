@@ -1,0 +1,59 @@
+# make run: set everything up, then train AIB on InterceptFast (a --quick trial where there is no CUDA device)
+# make test: set everything up, then lint and run the tests
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.ONESHELL:
+.SILENT:
+.PHONY: run test setup vulkan
+
+PYTHON ?= python3
+PY := .venv/bin/python
+
+run: setup
+	quick=$$($(PY) -c "import torch; print('' if torch.cuda.is_available() else '--quick')")
+	$(PY) ppo_aib.py --env-id InterceptFast-v0 $$quick
+
+test: setup
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pytest
+
+setup: .venv/installed vulkan
+
+.venv/installed: requirements.txt
+	$(PYTHON) -m venv .venv || { echo "error: $(PYTHON) cannot make a virtual environment; install python3-venv" >&2; exit 2; }
+	$(PY) -m pip install --requirement requirements.txt
+	$(PY) -m pip install --no-deps --ignore-requires-python mikasa-robo-suite==1.0.0
+	touch .venv/installed
+
+# Rendering needs a Vulkan driver. Where neither a GPU's nor another one works, install Mesa's CPU driver, 24.3 or newer.
+vulkan: .venv/installed
+	renders() { $(PY) -c "import sapien; sapien.render.RenderSystem(sapien.Device('$$1'))" >/dev/null 2>&1; }
+	if renders cuda || renders cpu; then exit 0; fi
+	if [ "$$(id -u)" = 0 ]; then root=; elif sudo -n true 2>/dev/null; then root=sudo; else root=none; fi
+	if [ "$$root" = none ] || ! command -v apt-get >/dev/null; then
+	    echo "error: no Vulkan driver that SAPIEN can use; ask the administrator to install mesa-vulkan-drivers (24.3 or" \
+	        "newer; on Debian 12 from bookworm-backports) and libvulkan1, then run make again" >&2
+	    exit 2
+	fi
+	export DEBIAN_FRONTEND=noninteractive
+	. /etc/os-release
+	$$root apt-get update
+	candidate=$$(apt-cache policy mesa-vulkan-drivers | awk '/Candidate:/ { print $$2 }')
+	release=
+	if dpkg --compare-versions "$$candidate" lt 24.3; then
+	    release=$$VERSION_CODENAME-backports
+	    # the machine's own entry for its release, with the suite changed, so that its mirror stays its mirror
+	    if [ -e /etc/apt/sources.list.d/debian.sources ]; then
+	        awk -v suite="$$VERSION_CODENAME" -v new="$$release" 'BEGIN { RS = ""; ORS = "\n\n" }
+	            $$0 ~ "(^|\n)Suites:([^\n]*[ \t])?" suite "([ \t\n]|$$)" { sub(/Suites:[^\n]*/, "Suites: " new); print; exit }' \
+	            /etc/apt/sources.list.d/debian.sources | $$root tee /etc/apt/sources.list.d/$$release.sources
+	    else
+	        awk -v suite="$$VERSION_CODENAME" -v new="$$release" \
+	            '$$1 == "deb" { for (i = 2; i <= NF; i++) if ($$i == suite) { $$i = new; print; exit } }' \
+	            /etc/apt/sources.list | $$root tee /etc/apt/sources.list.d/$$release.list
+	    fi
+	    $$root apt-get update
+	fi
+	$$root apt-get install --yes --no-install-recommends $${release:+--target-release $$release} mesa-vulkan-drivers libvulkan1
+	renders cpu || { echo "error: the Vulkan driver is installed, and SAPIEN still cannot render; see README" >&2; exit 2; }
