@@ -1,0 +1,293 @@
+"""Closed forms of every loss, the algorithm's lines, and where gradients go."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn as nn
+from torch.distributions import Normal
+
+import aib_belief
+import aib_repr
+import ppo_aib
+import ppo_believer
+
+IMAGE = [36, 36, 3]
+CONFIG = {"image_shape": IMAGE, "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
+T, B, A = 6, 3, 2
+
+
+def belief_model(head: str = "flow", config: dict = CONFIG) -> nn.ModuleDict:
+    torch.manual_seed(0)
+    model = nn.ModuleDict({"belief": aib_belief.AIBBelief(config)})
+    model["posterior"] = aib_belief.GaussianMLP(config["u_dim"] + 256, [32], config["z_dim"], min_std=0.1)
+    model["head"] = aib_belief.mlp([2 * config["z_dim"] + (A + 1) * (head == "flow"), 32, A])
+    return model
+
+
+def belief_batch(steps: int = T) -> dict[str, torch.Tensor]:
+    torch.manual_seed(1)
+    actions = torch.rand(steps, B, A) * 2 - 1
+    return {
+        "rgb": torch.randint(0, 256, (steps + 1, B, *IMAGE), dtype=torch.uint8),
+        "joints": torch.randn(steps + 1, B, 7),
+        "u": torch.randn(steps + 1, B, CONFIG["u_dim"]),
+        "actions": actions,
+        "previous": torch.cat([torch.zeros(1, B, A), actions]),
+    }
+
+
+def losses_args(**changes: object) -> SimpleNamespace:
+    defaults = dict(bptt_steps=None, amp=False, beta=1.0, action_head="flow", fm_latent="sample", action_lambda=1.0)
+    return SimpleNamespace(**{**defaults, **changes})
+
+
+# ---------------------------------------------------------------- stage 1
+
+
+def test_kl_to_unit_gaussian_is_the_closed_form() -> None:
+    mean, std = torch.randn(7, 16), torch.rand(7, 16) + 0.1
+    direct = 0.5 * (mean**2 + std**2 - 1 - 2 * std.log())
+    for reduction, expected in (("sum", direct.sum(-1).mean()), ("mean", direct.mean())):
+        assert torch.allclose(aib_repr.kl_to_unit_gaussian(Normal(mean, std), reduction), expected, atol=1e-5)
+
+
+def repr_model_and_batch() -> tuple[nn.ModuleDict, dict[str, torch.Tensor]]:
+    torch.manual_seed(0)
+    phi, psi = aib_repr.StateEncoder(5, 4), aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4)
+    model = nn.ModuleDict({"phi": phi, "psi": psi, "g": aib_repr.Predictor(4, A)})
+    batch = {"actions": torch.rand(B, A), "rewards": torch.randn(B)}
+    for name in ("", "next_"):
+        batch[name + "rgb"] = torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8)
+        batch[name + "joints"], batch[name + "state"] = torch.randn(B, 7), torch.randn(B, 5)
+    return model, batch
+
+
+def test_algorithm_1_line_by_line() -> None:
+    model, batch = repr_model_and_batch()
+    torch.manual_seed(3)
+    losses = aib_repr.repr_losses(model, batch, "sum")
+    torch.manual_seed(3)
+    q_s, q_o = model["phi"](batch["state"]), model["psi"](batch["rgb"], batch["joints"])
+    u_s = q_s.mean + q_s.stddev * torch.randn(B, 4)
+    u_o = q_o.mean + q_o.stddev * torch.randn(B, 4)
+    r, s, o = model["g"](u_s, u_o, batch["actions"])
+    s_next, o_next = model["phi"](batch["next_state"]).mean, model["psi"](batch["next_rgb"], batch["next_joints"]).mean
+    assert torch.allclose(losses["reward"], ((batch["rewards"] - r) ** 2).mean(), atol=1e-5)
+    assert torch.allclose(losses["state"], ((s_next - s) ** 2).sum(1).mean(), atol=1e-5)
+    assert torch.allclose(losses["obs"], ((o_next - o) ** 2).sum(1).mean(), atol=1e-5)
+
+
+def test_stage_1_targets_stop_the_gradient() -> None:
+    model, batch = repr_model_and_batch()
+    batch["next_state"].requires_grad_(True)
+    batch["next_joints"].requires_grad_(True)
+    losses = aib_repr.repr_losses(model, batch, "sum")
+    assert losses["state"].requires_grad and losses["obs"].requires_grad
+    sum(losses.values()).backward()
+    assert batch["next_state"].grad is None and batch["next_joints"].grad is None
+
+
+# ---------------------------------------------------------------- stage 2
+
+
+def test_elbo_terms_are_the_closed_forms() -> None:
+    model, u, h = belief_model(), torch.randn(T, B, 4), torch.randn(T, B, 256)
+    torch.manual_seed(2)
+    nll, kl, z, mean = aib_belief.elbo_terms(model["belief"], model["posterior"], u, h)
+    q, p = model["posterior"](torch.cat([u, h], -1)), model["belief"].prior(h)
+    d = model["belief"].decoder(torch.cat([z, h], -1))
+    direct = (p.stddev / q.stddev).log() + (q.variance + (q.mean - p.mean) ** 2) / (2 * p.variance) - 0.5
+    assert torch.allclose(kl, direct.sum(-1), atol=1e-4)
+    direct = 0.5 * ((u - d.mean) / d.stddev) ** 2 + d.stddev.log() + 0.5 * math.log(2 * math.pi)
+    assert torch.allclose(nll, direct.sum(-1), atol=1e-4)
+    assert torch.equal(mean, q.mean) and nll.shape == kl.shape == (T, B)
+
+
+@pytest.mark.parametrize("tau", [0.0, 1.0])
+def test_flow_matching_interpolates_from_noise_to_action(tau: float) -> None:
+    seen, action, noise = [], torch.rand(B, A), torch.randn(B, A)
+    z, z_next = torch.randn(B, 5), torch.randn(B, 5)
+
+    def head(x: torch.Tensor) -> torch.Tensor:
+        seen.append(x)
+        return torch.zeros(B, A)
+
+    loss = aib_belief.flow_matching_loss(head, action, z, z_next, noise, torch.full((B, 1), tau))
+    assert torch.allclose(seen[0], torch.cat([action if tau else noise, torch.full((B, 1), tau), z, z_next], -1))
+    assert torch.allclose(loss, ((action - noise) ** 2).sum(-1))
+
+
+def test_total_loss_adds_up_and_ablations_leave_their_term_out() -> None:
+    batch = belief_batch()
+    for head, terms in (("flow", {"nll", "kl", "action"}), ("mse", {"nll", "kl", "action"}), ("none", {"nll", "kl"})):
+        args = losses_args(action_head=head, beta=0.5, action_lambda=0.1)
+        losses = aib_belief.belief_losses(belief_model(head), batch, args)
+        assert losses.keys() == terms | {"total"}
+        total = losses["nll"] + 0.5 * losses["kl"] + 0.1 * losses.get("action", 0)
+        assert torch.allclose(losses["total"], total)
+
+
+def test_flow_loss_shapes_the_posterior_and_the_prior_only_through_the_kl() -> None:
+    model, batch = belief_model(), belief_batch()
+    losses = aib_belief.belief_losses(model, batch, losses_args())
+
+    def moved(loss: torch.Tensor, module: nn.Module) -> bool:
+        grads = torch.autograd.grad(loss, list(module.parameters()), retain_graph=True, allow_unused=True)
+        return any(g is not None and g.abs().sum() > 0 for g in grads)
+
+    assert moved(losses["action"], model["posterior"]) and moved(losses["action"], model["head"])
+    assert not moved(losses["action"], model["belief"].prior)
+    assert not moved(losses["nll"], model["belief"].prior)
+    assert moved(losses["kl"], model["belief"].prior)
+
+
+def test_believer_has_a_fixed_prior() -> None:
+    torch.manual_seed(0)
+    belief, h = ppo_believer.BelieverBelief(CONFIG), torch.randn(T, B, 256)
+    p = belief.prior(h)
+    assert torch.equal(p.mean, torch.zeros(T, B, 5)) and torch.equal(p.stddev, torch.ones(T, B, 5))
+    model = nn.ModuleDict({"belief": belief, "posterior": belief_model()["posterior"]})
+    losses = ppo_believer.believer_losses(model, belief_batch(), losses_args())
+    assert losses.keys() == {"nll", "kl", "total"}
+    z, u = torch.randn(B, 30, 5), torch.randn(B, 30, 4)
+    d = belief.decoder(torch.cat([z, h[0, :, None].expand(-1, 30, -1)], -1))
+    assert torch.allclose(belief.particles(h[0], z, u), d.mean + d.stddev * u, atol=1e-5)
+    assert torch.allclose(belief.particles(h[0], z, None), d.mean, atol=1e-5)
+
+
+def test_particles_are_draws_from_prior_and_decoder() -> None:
+    belief, h = belief_model()["belief"], torch.randn(B, 256)
+    z_noise, u_noise = torch.randn(B, 30, 5), torch.randn(B, 30, 4)
+    p = belief.prior(h)
+    for i in (0, 29):
+        d = belief.decoder(torch.cat([p.mean + p.stddev * z_noise[:, i], h], -1))
+        drawn = belief.particles(h, z_noise, u_noise)
+        assert drawn.shape == (B, 30, 4)
+        assert torch.allclose(drawn[:, i], d.mean + d.stddev * u_noise[:, i], atol=1e-5)
+
+
+@pytest.mark.parametrize("layers, joints, actions", [(1, 0, 0), (2, 7, A)])
+def test_sequence_and_step_path_agree(layers: int, joints: int, actions: int) -> None:
+    config = {**CONFIG, "gru_layers": layers, "joints_dim": joints, "action_dim": actions}
+    history, batch = belief_model(config=config)["belief"].history, belief_batch()
+    whole, _ = history(batch)
+    state = None
+    for t in range(T + 1):
+        now = {name: batch[name][t : t + 1] for name in ("rgb", "joints", "previous")}
+        h, state = history(now, state)
+        assert torch.allclose(h[0], whole[t], atol=1e-5)
+
+
+def gradient_of_first_frame(bptt_steps: int | None, steps: int = 59) -> torch.Tensor:
+    """Gradient of h at the last step with respect to the embedding of frame 0."""
+    history, batch = belief_model()["belief"].history, belief_batch(steps)
+    kept = []
+    handle = history.cnn.register_forward_hook(lambda module, x, y: (y.retain_grad(), kept.append(y))[1])
+    h, _ = history(batch, bptt_steps=bptt_steps)
+    handle.remove()
+    h[-1].sum().backward()
+    return kept[0].grad.view(steps + 1, B, -1)[0]
+
+
+def test_truncated_back_propagation_cuts_exactly() -> None:
+    assert gradient_of_first_frame(None).abs().sum() > 0
+    assert gradient_of_first_frame(16).abs().sum() == 0
+    assert torch.equal(gradient_of_first_frame(60), gradient_of_first_frame(None))
+
+
+def test_chrono_initialisation_sets_the_update_gate() -> None:
+    gru = nn.GRU(8, 64, 2)
+    aib_belief.chrono_init(gru, 60)
+    for layer in range(2):
+        bias = getattr(gru, f"bias_ih_l{layer}")[64:128] + getattr(gru, f"bias_hh_l{layer}")[64:128]
+        assert bias.min() >= 0 and bias.max() <= math.log(59) and bias.std() > 0.3
+    # with all weights 0 the update gate alone decides what is kept: sigmoid(bias), so about 1 / (1 - gate) steps
+    for name, parameter in gru.named_parameters():
+        if "weight" in name:
+            nn.init.zeros_(parameter)
+    kept = gru(torch.zeros(1, 1, 8), torch.ones(2, 1, 64))[1]
+    assert kept.mean() > 0.85
+
+
+def test_image_statistics(tmp_path: object) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (4, 3, 8, 8, 3), dtype=np.uint8)
+    np.save(tmp_path / "rgb.npy", rgb)
+    mean, std = aib_belief.image_statistics(tmp_path, np.arange(2))
+    assert torch.allclose(mean, torch.from_numpy(rgb[:2].mean((0, 1))).float(), atol=1e-3)
+    assert abs(std.item() - (rgb[:2] - rgb[:2].mean((0, 1))).std()) < 1e-2
+
+
+def test_readouts() -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(400, 6, generator=generator)
+    colour = (x[:, :1] > 0).float() * 3
+    velocity = x[:, 1:3] * 2 + 0.01 * torch.randn(400, 2, generator=generator)
+    fit, test = slice(0, 300), slice(300, 400)
+    assert aib_belief.score_readout(aib_belief.fit_readout(x[fit], colour[fit]), x[test], colour[test]) > 0.95
+    assert aib_belief.score_readout(aib_belief.fit_readout(x[fit], velocity[fit]), x[test], velocity[test]) > 0.99
+    noise = torch.randn(400, 1, generator=generator)
+    assert aib_belief.score_readout(aib_belief.fit_readout(x[fit], noise[fit]), x[test], noise[test]) < 0.1
+
+
+def test_flow_gain_tells_a_live_head_from_a_dead_one() -> None:
+    torch.manual_seed(0)
+    action = torch.rand(8, T, A) * 2 - 1
+    q = torch.zeros(8, T + 1, 5)
+    q[:, 1:, :A] = action  # z_t+1 names the action, so that a_1 - a_0 = (a_1 - a_tau) / (1 - tau) is known
+
+    def live(x: torch.Tensor) -> torch.Tensor:
+        a_tau, tau, z_next = x[..., :A], x[..., A : A + 1], x[..., A + 1 + 5 :]
+        return (z_next[..., :A] - a_tau) / (1 - tau).clamp(min=1e-3)
+
+    assert aib_belief.flow_gain(live, q, action) > 0.5
+    assert aib_belief.flow_gain(lambda x: torch.zeros_like(x[..., :A]), q, action) == 0
+
+
+# ---------------------------------------------------------------- stage 3
+
+
+def test_gae_is_the_double_sum() -> None:
+    rewards, values, gamma, lam = torch.randn(9, B), torch.randn(10, B), 0.95, 0.9
+    advantages = ppo_aib.compute_gae(rewards, values, gamma, lam)
+    for t in range(9):
+        direct = torch.zeros(B)
+        for k in range(t, 9):
+            delta = rewards[k] + gamma * values[k + 1] - values[k]
+            direct += (gamma * lam) ** (k - t) * delta
+        assert torch.allclose(advantages[t], direct, atol=1e-5)
+
+
+def test_belief_aggregator_is_the_papers_formula_and_ignores_the_order_of_particles() -> None:
+    torch.manual_seed(0)
+    agent = ppo_aib.BeliefAgent(IMAGE, 7, A, 4)
+    obs = {"rgb": torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8), "joints": torch.randn(B, 7)}
+    particles = torch.randn(B, 30, 4)
+    policy, value = agent({**obs, "particles": particles})
+    again, value_again = agent({**obs, "particles": particles.flip(1)})
+    assert policy.mean.shape == (B, A) and value.shape == (B,)
+    assert torch.allclose(policy.mean, again.mean, atol=1e-6) and torch.allclose(value, value_again, atol=1e-6)
+    belief = agent.w_agg(torch.stack([agent.w_enc(particles[:, i]) for i in range(30)]).mean(0))
+    image, joints = agent.cnn(obs["rgb"].float() / 255), agent.joints(obs["joints"])
+    x = torch.cat([image, joints, belief], -1)
+    assert torch.allclose(policy.mean, torch.tanh(agent.actor(x)), atol=1e-6)
+
+
+def test_ppo_losses_are_the_closed_forms() -> None:
+    args = SimpleNamespace(clip_coef=0.2, ent_coef=0.01, vf_coef=0.5)
+    mean, log_std = torch.randn(64, A), torch.full((A,), -0.5)
+    policy, value = Normal(mean, log_std.exp().expand(64, A)), torch.randn(64)
+    batch = {"action": policy.sample(), "advantage": torch.randn(64), "return": torch.randn(64)}
+    batch["logprob"] = policy.log_prob(batch["action"]).sum(-1) + 0.3 * torch.randn(64)
+    losses = ppo_aib.ppo_losses(lambda _: (policy, value), batch, args)
+    ratio = (policy.log_prob(batch["action"]).sum(-1) - batch["logprob"]).exp()
+    a = (batch["advantage"] - batch["advantage"].mean()) / (batch["advantage"].std() + 1e-8)
+    surrogate = torch.where(a >= 0, ratio.clamp(max=1.2) * a, ratio.clamp(min=0.8) * a)
+    assert torch.allclose(losses["policy_loss"], -surrogate.mean(), atol=1e-6)
+    assert torch.allclose(losses["value_loss"], 0.5 * ((value - batch["return"]) ** 2).mean())
+    entropy = A * (-0.5 + 0.5 * math.log(2 * math.pi * math.e))
+    assert abs(losses["entropy"].item() - entropy) < 1e-4
+    total = losses["policy_loss"] - 0.01 * losses["entropy"] + 0.5 * losses["value_loss"]
+    assert torch.allclose(losses["total"], total)
