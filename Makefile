@@ -24,6 +24,8 @@ setup: .venv/installed vulkan
 	$(PYTHON) -m venv .venv || { echo "error: $(PYTHON) cannot make a virtual environment; install python3-venv" >&2; exit 2; }
 	$(PY) -m pip install --requirement requirements.txt
 	$(PY) -m pip install --no-deps --ignore-requires-python mikasa-robo-suite==1.0.0
+	$(PY) -m pip uninstall --yes opencv-python  # ManiSkill's choice needs libGL.so.1, which servers lack
+	$(PY) -m pip install --force-reinstall --no-deps opencv-python-headless
 	touch .venv/installed
 
 # Rendering needs a Vulkan driver. Where neither a GPU's nor another one works, install Mesa's CPU driver, 24.3 or newer.
@@ -33,7 +35,7 @@ vulkan: .venv/installed
 	if [ "$$(id -u)" = 0 ]; then root=; elif sudo -n true 2>/dev/null; then root=sudo; else root=none; fi
 	if [ "$$root" = none ] || ! command -v apt-get >/dev/null; then
 	    echo "error: no Vulkan driver that SAPIEN can use; ask the administrator to install mesa-vulkan-drivers (24.3 or" \
-	        "newer; on Debian 12 from bookworm-backports) and libvulkan1, then run make again" >&2
+	        "newer; on Debian 12 from bookworm-backports) libvulkan1 and libx11-6, then run make again" >&2
 	    exit 2
 	fi
 	export DEBIAN_FRONTEND=noninteractive
@@ -55,5 +57,5 @@ vulkan: .venv/installed
 	    fi
 	    $$root apt-get update
 	fi
-	$$root apt-get install --yes --no-install-recommends $${release:+--target-release $$release} mesa-vulkan-drivers libvulkan1
+	$$root apt-get install --yes --no-install-recommends $${release:+--target-release $$release} mesa-vulkan-drivers libvulkan1 libx11-6
 	renders cpu || { echo "error: the Vulkan driver is installed, and SAPIEN still cannot render; see README" >&2; exit 2; }
