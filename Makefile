@@ -20,7 +20,7 @@ test: setup
 
 setup: .venv/installed vulkan
 
-.venv/installed: requirements.txt
+.venv/installed: requirements.txt Makefile
 	$(PYTHON) -m venv .venv || { echo "error: $(PYTHON) cannot make a virtual environment; install python3-venv" >&2; exit 2; }
 	$(PY) -m pip install --requirement requirements.txt
 	$(PY) -m pip install --no-deps --ignore-requires-python mikasa-robo-suite==1.0.0
