@@ -333,12 +333,10 @@ def make_envs(args: "Args", num_episodes: int) -> gym.vector.VectorEnv:
     if args.env_id not in tasks:
         near = difflib.get_close_matches(args.env_id, tasks, cutoff=0)
         fail(f"unknown task --env-id {args.env_id}; the nearest names are {', '.join(near)}")
-    for group in tasks[args.env_id].asset_download_ids or []:
-        if not all(
-            map(assets.is_data_source_downloaded, assets.expand_data_group_into_individual_data_source_ids(group))
-        ):
-            get = f"python -m mani_skill.utils.download_asset {group}"
-            fail(f"{args.env_id} needs the asset '{group}', which is not on this machine; fetch it with: {get}")
+    for asset in tasks[args.env_id].asset_download_ids or []:
+        if not assets.is_data_source_downloaded(asset):
+            get = f"python -m mani_skill.utils.download_asset {asset}"
+            fail(f"{args.env_id} needs the asset '{asset}', which is not on this machine; fetch it with: {get}")
     if args.num_workers is None:
         cores = len(os.sched_getaffinity(0))
         args.num_workers = max(n for n in range(1, cores + 1) if num_episodes % n == 0)
