@@ -56,15 +56,15 @@ class Args:
     seed: int = 1
     """seed of weights, noise and episodes"""
     device: Literal["cpu", "cuda"] | None = None
-    """where the networks live (default: cuda if there is one)"""
+    """where the networks live; None: cuda if there is one"""
     sim_backend: Literal["physx_cpu", "physx_cuda"] | None = None
-    """physics, if stage 1 has to run first (default: physx_cuda on a cuda device)"""
+    """physics, if stage 1 has to run first; None: physx_cuda on a cuda device"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] | None = None
-    """renderer, if stage 1 has to run first (default: sapien_cuda on a cuda device)"""
+    """renderer, if stage 1 has to run first; None: sapien_cuda on a cuda device"""
     robot: Literal["panda_wristcam", "panda"] | None = None
-    """panda renders 3 times faster on a CPU (default: panda_wristcam, which is MIKASA's; quick: panda)"""
+    """panda renders 3 times faster on a CPU; None: panda_wristcam, MIKASA's default (quick: panda)"""
     num_workers: int | None = None
-    """simulator processes, if stage 1 has to run first (default: as many as there are cores)"""
+    """simulator processes, if stage 1 has to run first; None: as many as there are cores"""
     quick: bool = False
     """a trial of a minute or two whose results mean nothing"""
     overwrite: bool = False
@@ -73,11 +73,11 @@ class Args:
     """minutes between checkpoints"""
 
     repr_dir: Path | None = None
-    """run directory of stage 1 (default: runs/{env_id}__aib_repr__{seed})"""
+    """run directory of stage 1; None: runs/{env_id}__aib_repr__{seed}"""
     num_updates: int | None = None
-    """gradient updates; the paper calls them epochs (default: 10000, quick: 4)"""
+    """gradient updates; the paper calls them epochs; None: 10000, quick: 4"""
     batch_episodes: int | None = None
-    """whole episodes per update (default: 256, quick: 4)"""
+    """whole episodes per update; None: 256, quick: 4"""
     belief_lr: float = 3e-4
     """Adam's learning rate"""
     z_dim: int = 32
@@ -91,7 +91,7 @@ class Args:
     fm_latent: Literal["sample", "mean"] = "sample"
     """what the action head sees of the posterior"""
     bptt_steps: int | None = None
-    """cut back-propagation through time after so many steps (default: never)"""
+    """cut back-propagation through time after so many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
     """subtract the dataset's mean image and divide by what varies, or just divide by 255"""
     chrono_init: bool = True
@@ -103,7 +103,7 @@ class Args:
     history_actions: bool = False
     """previous actions in the history; then z can carry them with no regard for the world"""
     amp: bool | None = None
-    """bfloat16 convolutions (default: on CUDA and on CPUs with bfloat16 instructions)"""
+    """bfloat16 convolutions; None: on CUDA and on CPUs with bfloat16 instructions"""
     held_out_every: int = 50
     """updates between looks at the held-out episodes; the best weights are kept"""
 
@@ -445,7 +445,7 @@ def flow_gain(head: nn.Module, q: torch.Tensor, action: torch.Tensor) -> float:
 def plot_diagnostics(report: dict, title: str) -> bytes:
     """Draw the report as a PNG: the cue's read-out and the reconstruction of u against time."""
     matplotlib.use("Agg")
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
     names = {"cue_from_u": "u (ceiling)", "cue_from_h": "h", "cue_from_particle": "mean particle"}
     for (name, label), style in zip(names.items(), ("k:", "C0-", "C1-"), strict=True):
         left.plot(report[name], style, label=label)
@@ -455,7 +455,7 @@ def plot_diagnostics(report: dict, title: str) -> bytes:
     right.plot(report["u_r2_prior"], "C1-", label="prior (mean particle)")
     right.set(xlabel="step", ylabel="R2", title="reconstruction of u", ylim=(-0.05, 1.05))
     for axes in (left, right):
-        axes.legend(loc="lower left")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, frameon=False)
         axes.grid(alpha=0.3)
     gain = "" if "flow_gain" not in report else f", flow gain {report['flow_gain']:.3f}"
     figure.suptitle(f"{title}: action read-out R2 {report['action_readout']:.3f}{gain}")

@@ -51,17 +51,17 @@ class Args:
     seed: int = 1
     """seed of weights, noise and episodes"""
     device: Literal["cpu", "cuda"] | None = None
-    """where the networks live (default: cuda if there is one)"""
+    """where the networks live; None: cuda if there is one"""
     sim_backend: Literal["physx_cpu", "physx_cuda"] | None = None
-    """physics (default: physx_cuda on a cuda device)"""
+    """physics; None: physx_cuda on a cuda device"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] | None = None
-    """renderer (default: sapien_cuda on a cuda device)"""
+    """renderer; None: sapien_cuda on a cuda device"""
     robot: Literal["panda_wristcam", "panda"] | None = None
-    """panda renders 3 times faster on a CPU (default: panda_wristcam, which is MIKASA's; quick: panda)"""
+    """panda renders 3 times faster on a CPU; None: panda_wristcam, MIKASA's default (quick: panda)"""
     num_workers: int | None = None
-    """simulator processes on physx_cpu, which must divide the episodes (default: as many as there are cores)"""
+    """simulator processes on physx_cpu, which must divide the episodes; None: as many as there are cores"""
     num_envs: int | None = None
-    """scenes simulated at a time on physx_cuda, which must divide the episodes (default: 250, quick: 16)"""
+    """scenes simulated at a time on physx_cuda, which must divide the episodes; None: 250, quick: 16"""
     quick: bool = False
     """a trial of a minute or two whose results mean nothing"""
     overwrite: bool = False
@@ -70,11 +70,11 @@ class Args:
     """minutes between checkpoints"""
 
     num_episodes: int | None = None
-    """episodes of the random policy (default: 1000, quick: 16)"""
+    """episodes of the random policy; None: 1000, quick: 16"""
     val_share: float | None = None
-    """share of the episodes held out (default: 0.05, quick: 0.25)"""
+    """share of the episodes held out; None: 0.05, quick: 0.25"""
     epochs: int | None = None
-    """passes over the training transitions (default: 200, quick: 2)"""
+    """passes over the training transitions; None: 200, quick: 2"""
     batch_size: int = 500
     """transitions per update"""
     learning_rate: float = 3e-4

@@ -51,15 +51,15 @@ class Args:
     seed: int = 1
     """seed of weights, noise and episodes"""
     device: Literal["cpu", "cuda"] | None = None
-    """where the networks live (default: cuda if there is one)"""
+    """where the networks live; None: cuda if there is one"""
     sim_backend: Literal["physx_cpu", "physx_cuda"] | None = None
-    """physics (default: physx_cuda on a cuda device)"""
+    """physics; None: physx_cuda on a cuda device"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] | None = None
-    """renderer (default: sapien_cuda on a cuda device)"""
+    """renderer; None: sapien_cuda on a cuda device"""
     robot: Literal["panda_wristcam", "panda"] | None = None
-    """panda renders 3 times faster on a CPU (default: panda_wristcam, which is MIKASA's; quick: panda)"""
+    """panda renders 3 times faster on a CPU; None: panda_wristcam, MIKASA's default (quick: panda)"""
     num_workers: int | None = None
-    """simulator processes on physx_cpu, which must divide num_envs (default: as many as there are cores)"""
+    """simulator processes on physx_cpu, which must divide num_envs; None: as many as there are cores"""
     quick: bool = False
     """a trial of a few minutes whose results mean nothing"""
     overwrite: bool = False
@@ -68,17 +68,17 @@ class Args:
     """minutes between checkpoints"""
 
     total_timesteps: int | None = None
-    """environment steps of training (default: by task, Table 5; quick: 720)"""
+    """environment steps of training; None: by task, Table 5 (quick: 720)"""
     num_envs: int | None = None
-    """whole episodes per iteration, on any number of workers (default: by task, Table 5; quick: 4)"""
+    """whole episodes per iteration, on any number of workers; None: by task, Table 5 (quick: 4)"""
     learning_rate: float = 1e-4
     """Adam's"""
     update_epochs: int | None = None
-    """passes over an iteration's data (default: by task, Table 5)"""
+    """passes over an iteration's data; None: by task, Table 5"""
     num_minibatches: int = 32
     """minibatches per pass"""
     gamma: float | None = None
-    """discount (default: by task, Table 5)"""
+    """discount; None: by task, Table 5"""
     gae_lambda: float = 0.9
     """lambda of generalised advantage estimation"""
     clip_coef: float = 0.2
@@ -92,13 +92,13 @@ class Args:
     target_kl: float = 0.05
     """an iteration's update ends when the policy has moved so far"""
     eval_every: int | None = None
-    """iterations between evaluations (default: 25, quick: 2)"""
+    """iterations between evaluations; None: 25, quick: 2"""
     num_eval_episodes: int | None = None
-    """episodes per evaluation, the same every time (default: 192, quick: 4)"""
+    """episodes per evaluation, the same every time; None: 192, quick: 4"""
     evaluate: bool = False
     """only evaluate a checkpoint"""
     checkpoint: Path | None = None
-    """the agent.pt to evaluate (default: the one in the run directory)"""
+    """the agent.pt to evaluate; None: the one in the run directory"""
 
 
 PPO_DEFAULTS = dict(

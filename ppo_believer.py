@@ -60,15 +60,15 @@ class Args:
     seed: int = 1
     """seed of weights, noise and episodes"""
     device: Literal["cpu", "cuda"] | None = None
-    """where the networks live (default: cuda if there is one)"""
+    """where the networks live; None: cuda if there is one"""
     sim_backend: Literal["physx_cpu", "physx_cuda"] | None = None
-    """physics (default: physx_cuda on a cuda device)"""
+    """physics; None: physx_cuda on a cuda device"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] | None = None
-    """renderer (default: sapien_cuda on a cuda device)"""
+    """renderer; None: sapien_cuda on a cuda device"""
     robot: Literal["panda_wristcam", "panda"] | None = None
-    """panda renders 3 times faster on a CPU (default: panda_wristcam, which is MIKASA's; quick: panda)"""
+    """panda renders 3 times faster on a CPU; None: panda_wristcam, MIKASA's default (quick: panda)"""
     num_workers: int | None = None
-    """simulator processes on physx_cpu, which must divide num_envs (default: as many as there are cores)"""
+    """simulator processes on physx_cpu, which must divide num_envs; None: as many as there are cores"""
     quick: bool = False
     """a trial of a few minutes whose results mean nothing"""
     overwrite: bool = False
@@ -77,11 +77,11 @@ class Args:
     """minutes between checkpoints"""
 
     repr_dir: Path | None = None
-    """run directory of stage 1 (default: runs/{env_id}__aib_repr__{seed})"""
+    """run directory of stage 1; None: runs/{env_id}__aib_repr__{seed}"""
     num_updates: int | None = None
-    """gradient updates of the belief; the paper calls them epochs (default: 10000, quick: 4)"""
+    """gradient updates of the belief; the paper calls them epochs; None: 10000, quick: 4"""
     batch_episodes: int | None = None
-    """whole episodes per update of the belief (default: 256, quick: 4)"""
+    """whole episodes per update of the belief; None: 256, quick: 4"""
     belief_lr: float = 3e-4
     """Adam's learning rate for the belief"""
     z_dim: int = 32
@@ -89,7 +89,7 @@ class Args:
     beta: float = 1.0
     """weight of KL(q || N(0, I))"""
     bptt_steps: int | None = None
-    """cut back-propagation through time after so many steps (default: never)"""
+    """cut back-propagation through time after so many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
     """subtract the dataset's mean image and divide by what varies, or just divide by 255"""
     chrono_init: bool = True
@@ -101,7 +101,7 @@ class Args:
     history_actions: bool = False
     """previous actions in the history"""
     amp: bool | None = None
-    """bfloat16 convolutions in the belief's training (default: on CUDA and on CPUs with bfloat16 instructions)"""
+    """bfloat16 convolutions in the belief's training; None: on CUDA and on CPUs with bfloat16 instructions"""
     held_out_every: int = 50
     """updates between looks at the held-out episodes; the best weights are kept"""
 
@@ -110,17 +110,17 @@ class Args:
     particle_noise: bool = True
     """draw each particle from the decoder's Gaussian; without it, take its mean"""
     total_timesteps: int | None = None
-    """environment steps of training (default: by task, Table 5; quick: 720)"""
+    """environment steps of training; None: by task, Table 5 (quick: 720)"""
     num_envs: int | None = None
-    """whole episodes per iteration, on any number of workers (default: by task, Table 5; quick: 4)"""
+    """whole episodes per iteration, on any number of workers; None: by task, Table 5 (quick: 4)"""
     learning_rate: float = 1e-4
     """Adam's"""
     update_epochs: int | None = None
-    """passes over an iteration's data (default: by task, Table 5)"""
+    """passes over an iteration's data; None: by task, Table 5"""
     num_minibatches: int = 32
     """minibatches per pass"""
     gamma: float | None = None
-    """discount (default: by task, Table 5)"""
+    """discount; None: by task, Table 5"""
     gae_lambda: float = 0.9
     """lambda of generalised advantage estimation"""
     clip_coef: float = 0.2
@@ -134,13 +134,13 @@ class Args:
     target_kl: float = 0.05
     """an iteration's update ends when the policy has moved so far"""
     eval_every: int | None = None
-    """iterations between evaluations (default: 25, quick: 2)"""
+    """iterations between evaluations; None: 25, quick: 2"""
     num_eval_episodes: int | None = None
-    """episodes per evaluation, the same every time (default: 192, quick: 4)"""
+    """episodes per evaluation, the same every time; None: 192, quick: 4"""
     evaluate: bool = False
     """only evaluate a checkpoint"""
     checkpoint: Path | None = None
-    """the agent.pt to evaluate (default: the one in the run directory)"""
+    """the agent.pt to evaluate; None: the one in the run directory"""
 
 
 BELIEF_DEFAULTS = dict(num_updates=10_000, batch_episodes=256)
@@ -793,7 +793,7 @@ def diagnose_belief(fit: dict, test: dict, cue_fit: torch.Tensor, cue_test: torc
 def plot_diagnostics(report: dict, title: str) -> bytes:
     """Draw the report as a PNG: the cue's read-out and the reconstruction of u against time."""
     matplotlib.use("Agg")
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
     names = {"cue_from_u": "u (ceiling)", "cue_from_h": "h", "cue_from_particle": "mean particle"}
     for (name, label), style in zip(names.items(), ("k:", "C0-", "C1-"), strict=True):
         left.plot(report[name], style, label=label)
@@ -803,7 +803,7 @@ def plot_diagnostics(report: dict, title: str) -> bytes:
     right.plot(report["u_r2_prior"], "C1-", label="prior (mean particle)")
     right.set(xlabel="step", ylabel="R2", title="reconstruction of u", ylim=(-0.05, 1.05))
     for axes in (left, right):
-        axes.legend(loc="lower left")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, frameon=False)
         axes.grid(alpha=0.3)
     gain = "" if "flow_gain" not in report else f", flow gain {report['flow_gain']:.3f}"
     figure.suptitle(f"{title}: action read-out R2 {report['action_readout']:.3f}{gain}")
