@@ -1,10 +1,11 @@
 # make run: set everything up, then train AIB on InterceptFast (a --quick trial where there is no CUDA device)
 # make test: set everything up, then lint and run the tests
+# make bench-belief: train the belief and its ablations on RememberColor3 and print what each remembers
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .ONESHELL:
 .SILENT:
-.PHONY: run test setup vulkan
+.PHONY: run test bench-belief setup vulkan
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -17,6 +18,9 @@ test: setup
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m pytest
+
+bench-belief: setup
+	$(PY) benchmark/belief.py
 
 setup: .venv/installed vulkan
 

@@ -93,6 +93,8 @@ class Args:
     """standardise rewards; without it the reward term of a random policy is next to nothing"""
     kl_reduction: Literal["sum", "mean"] = "sum"
     """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
+    amp: bool | None = None
+    """bfloat16 convolutions; None: on CUDA and on CPUs with bfloat16 instructions"""
 
 
 DEFAULTS = dict(robot="panda_wristcam", num_envs=250, num_episodes=1000, val_share=0.05, epochs=200)
@@ -120,6 +122,11 @@ def resolve(args: "Args", defaults: dict) -> "Args":
         if getattr(args, name) is None:
             setattr(args, name, value)
     return args
+
+
+def has_bfloat16(device: str) -> bool:
+    """Whether bfloat16 is fast on the device: on CUDA, and on CPUs that name such instructions to Linux."""
+    return device == "cuda" or "bf16" in Path("/proc/cpuinfo").read_text()
 
 
 def write_file(path: Path, content: bytes) -> None:
@@ -557,15 +564,18 @@ class StateEncoder(nn.Module):
 class ObservationEncoder(nn.Module):
     """psi: rgb (B, H, W, 3) uint8 and joints (B, J), standardised inside, -> Normal over u^o (B, u_dim) (paper 3.1)."""
 
-    def __init__(self, image_shape: tuple[int, ...], joints_dim: int, u_dim: int):
+    def __init__(self, image_shape: tuple[int, ...], joints_dim: int, u_dim: int, amp: bool = False):
         super().__init__()
+        self.amp = amp
         self.register_buffer("mean", torch.zeros(joints_dim))
         self.register_buffer("std", torch.ones(joints_dim))
         self.cnn = NatureCNN(image_shape, 256)
         self.net = GaussianMLP(256 + joints_dim, [256, 256], u_dim, min_std=1e-5)
 
     def forward(self, rgb: torch.Tensor, joints: torch.Tensor) -> Normal:
-        return self.net(torch.cat([self.cnn(rgb.float() / 255), (joints - self.mean) / self.std], -1))
+        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=self.amp):
+            image = self.cnn(rgb.float() / 255)
+        return self.net(torch.cat([image.float(), (joints - self.mean) / self.std], -1))
 
 
 class Predictor(nn.Module):
@@ -674,6 +684,7 @@ def diagnose_repr(
 def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
     args = resolve(args, QUICK if args.quick else DEFAULTS)
+    args.amp = has_bfloat16(args.device) if args.amp is None else args.amp
     num_val = math.ceil(args.num_episodes * args.val_share)
     if not 0 < num_val < args.num_episodes:
         fail(f"--val-share {args.val_share} of {args.num_episodes} leaves no episode held out or to train on; try 0.05")
@@ -689,7 +700,7 @@ def main(args: Args) -> None:
 
         seed_everything(args.seed)
         phi = StateEncoder(arrays["state"].shape[-1], args.u_dim)
-        psi = ObservationEncoder(arrays["rgb"].shape[2:], arrays["joints"].shape[-1], args.u_dim)
+        psi = ObservationEncoder(arrays["rgb"].shape[2:], arrays["joints"].shape[-1], args.u_dim, args.amp)
         for encoder, values in ((phi, arrays["state"][train]), (psi, arrays["joints"][train])):
             encoder.mean.copy_(torch.from_numpy(values.mean((0, 1), dtype=np.float64)))
             encoder.std.copy_(torch.from_numpy(values.std((0, 1), dtype=np.float64).clip(1e-3)))

@@ -178,6 +178,11 @@ def resolve(args: "Args", defaults: dict) -> "Args":
     return args
 
 
+def has_bfloat16(device: str) -> bool:
+    """Whether bfloat16 is fast on the device: on CUDA, and on CPUs that name such instructions to Linux."""
+    return device == "cuda" or "bf16" in Path("/proc/cpuinfo").read_text()
+
+
 def write_file(path: Path, content: bytes) -> None:
     """Write whole or not at all: to a temporary name in the same folder, flushed to the disk, then renamed."""
     part = path.with_name(path.name + ".part")
@@ -1282,8 +1287,7 @@ def main(args: Args) -> None:
     defaults = PPO_DEFAULTS | TASKS.get(args.env_id, {}) | BELIEF_DEFAULTS
     args = resolve(args, defaults | (PPO_QUICK | BELIEF_QUICK if args.quick else {}))
     args.repr_dir = str(args.repr_dir or Path("runs") / f"{args.env_id}__aib_repr__{args.seed}")
-    if args.amp is None:  # x86 and Arm name their bfloat16 instructions there
-        args.amp = args.device == "cuda" or "bf16" in Path("/proc/cpuinfo").read_text()
+    args.amp = has_bfloat16(args.device) if args.amp is None else args.amp
     if args.evaluate:
         evaluate_checkpoint(args, "ppo_believer agent", build_believer)
         return

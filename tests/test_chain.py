@@ -8,8 +8,9 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from conftest import run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from conftest import run
 
 pytestmark = pytest.mark.slow
 TASK = "RememberShapeAndColor3x2-v0"

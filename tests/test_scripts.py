@@ -4,6 +4,7 @@ import ast
 from collections import defaultdict
 
 import pytest
+
 from conftest import ROOT, SCRIPTS
 
 TREES = {name: ast.parse((ROOT / f"{name}.py").read_text()) for name in SCRIPTS}
