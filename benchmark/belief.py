@@ -128,8 +128,8 @@ def main(args: Args) -> None:
     last = len(reports[args.rows[0]]["u_r2_prior"]) - 2
     steps = [4, 9, 30, last]
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    print(f"\n{args.env_id}, {args.robot}, {args.num_episodes} episodes (a tenth held out), {args.num_updates} updates")
-    print(f"of {args.batch_episodes} episodes, torch {torch.__version__} on {device}")
+    print(f"\n{args.env_id}, {args.robot}, {args.num_episodes} episodes (a tenth held out), {args.num_updates}")
+    print(f"updates of {args.batch_episodes} episodes, torch {torch.__version__} on {device}")
     print("stage 1: " + ", ".join(f"{name} {value:.3f}" for name, value in stage1.items()))
     print(f"cue read-out: chance {reports[args.rows[0]]['cue_chance']:.3f}; steps {steps}\n")
     columns = [

@@ -17,8 +17,8 @@ STAGES = {"aib_repr": aib_repr, "aib_belief": aib_belief}
 METHODS = {"ppo_aib": ppo_aib, "ppo_believer": ppo_believer, "ppo_baseline": ppo_baseline}
 REPR = dict(num_episodes=300, epochs=12, batch_size=100, learning_rate=1e-3)
 BELIEF = dict(num_updates=200, batch_episodes=24, belief_lr=1e-3, held_out_every=50)
-PPO = dict(total_timesteps=64 * 10 * 60, num_envs=64, learning_rate=1e-3, num_minibatches=8, update_epochs=4)
-PPO |= dict(eval_every=20, num_eval_episodes=192, ent_coef=0.0)
+PPO = dict(total_timesteps=64 * 10 * 30, num_envs=64, learning_rate=1e-3, num_minibatches=8, update_epochs=4)
+PPO |= dict(eval_every=5, num_eval_episodes=192, ent_coef=0.0)
 
 
 @pytest.fixture(autouse=True)
