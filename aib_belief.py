@@ -609,7 +609,9 @@ def seed_everything(seed: int, *counter: int) -> None:
 
 def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]:
     """Turn loss terms into numbers; one that is not finite ends the run with exit code 1 and leaves the checkpoint."""
-    values = {name: value.item() for name, value in terms.items()}
+    values = dict(
+        zip(terms, torch.stack([x.detach() for x in terms.values()]).tolist(), strict=True)
+    )  # one wait for the GPU
     for name, value in values.items():
         if not math.isfinite(value):
             fail(f"{name} is {value} at {where}; the last checkpoint is kept: try a lower --learning-rate", code=1)
@@ -732,6 +734,7 @@ def train_belief(
                 if values["nll_prior"] < best_nll:
                     best_nll, best = values["nll_prior"], copy.deepcopy(model.state_dict())
             if stop.received or time.time() - saved > 60 * args.checkpoint_minutes:
+                check_finite({n: x.sum() for n, x in model.named_parameters()}, f"update {update} of stage 2")
                 checkpoint = {"model": model.state_dict(), "optimizer": optimizer.state_dict(), "best": best}
                 save(file, {"kind": kind, "update": update, "best_nll": best_nll, **checkpoint})
                 saved = time.time()

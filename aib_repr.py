@@ -231,7 +231,9 @@ def seed_everything(seed: int, *counter: int) -> None:
 
 def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]:
     """Turn loss terms into numbers; one that is not finite ends the run with exit code 1 and leaves the checkpoint."""
-    values = {name: value.item() for name, value in terms.items()}
+    values = dict(
+        zip(terms, torch.stack([x.detach() for x in terms.values()]).tolist(), strict=True)
+    )  # one wait for the GPU
     for name, value in values.items():
         if not math.isfinite(value):
             fail(f"{name} is {value} at {where}; the last checkpoint is kept: try a lower --learning-rate", code=1)
@@ -756,6 +758,7 @@ def main(args: Args) -> None:
                     for name in coefs:
                         writer.add_scalar(f"held_out/{name}", torch.stack([p[name] for p in parts]).mean(), update)
                 if stop.received or time.time() - saved > 60 * args.checkpoint_minutes:
+                    check_finite({n: x.sum() for n, x in model.named_parameters()}, f"update {update} of stage 1")
                     checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
                     save(path / "checkpoint.pt", {"kind": "aib_repr checkpoint", **checkpoint})
                     saved = time.time()

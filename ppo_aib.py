@@ -106,6 +106,12 @@ class Args:
     """iterations between evaluations; None: 25, quick: 2"""
     num_eval_episodes: int | None = None
     """episodes per evaluation, the same every time; None: 192, quick: 4"""
+    compile: bool = False
+    """compile policy, advantages and update with torch.compile; pays on CUDA"""
+    amp: bool = False
+    """bfloat16 convolutions in the policy"""
+    track: bool = False
+    """also log to Weights & Biases"""
     evaluate: bool = False
     """only evaluate a checkpoint"""
     checkpoint: Path | None = None
@@ -251,7 +257,9 @@ def seed_everything(seed: int, *counter: int) -> None:
 
 def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]:
     """Turn loss terms into numbers; one that is not finite ends the run with exit code 1 and leaves the checkpoint."""
-    values = {name: value.item() for name, value in terms.items()}
+    values = dict(
+        zip(terms, torch.stack([x.detach() for x in terms.values()]).tolist(), strict=True)
+    )  # one wait for the GPU
     for name, value in values.items():
         if not math.isfinite(value):
             fail(f"{name} is {value} at {where}; the last checkpoint is kept: try a lower --learning-rate", code=1)
@@ -585,8 +593,9 @@ def orthogonal_init(module: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
 class BeliefAgent(nn.Module):
     """Actor and critic on image, joints and belief (paper 3.3): W(b) = W_agg(mean over particles of W_enc(u_i))."""
 
-    def __init__(self, image_shape: list[int], joints_dim: int, action_dim: int, u_dim: int):
+    def __init__(self, image_shape: list[int], joints_dim: int, action_dim: int, u_dim: int, amp: bool = False):
         super().__init__()
+        self.amp = amp
         self.cnn = orthogonal_init(NatureCNN(image_shape, 256))
         self.joints = orthogonal_init(nn.Linear(joints_dim, 128))
         self.w_enc = orthogonal_init(mlp([u_dim, 64, 64]))
@@ -600,7 +609,9 @@ class BeliefAgent(nn.Module):
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u)."""
         belief = self.w_agg(self.w_enc(obs["particles"]).mean(-2))
-        x = torch.cat([self.cnn(obs["rgb"].float() / 255), self.joints(obs["joints"]), belief], -1)
+        with torch.autocast(obs["rgb"].device.type, torch.bfloat16, enabled=self.amp):
+            image = self.cnn(obs["rgb"].float() / 255)
+        x = torch.cat([image.float(), self.joints(obs["joints"]), belief], -1)
         mean = torch.tanh(self.actor(x))
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
 
@@ -690,13 +701,16 @@ def ppo_update(
     agent: nn.Module, optimizer: torch.optim.Optimizer, data: dict[str, torch.Tensor], args: "Args", stop: StopSignal
 ) -> dict[str, float]:
     """Update the agent on what gather stored, until the last epoch or the KL target; returns the last losses."""
-    advantage = compute_gae(data["reward"], data["value"], args.gamma, args.gae_lambda)
+    gae, losses_of = (
+        (torch.compile(compute_gae), torch.compile(ppo_losses)) if args.compile else (compute_gae, ppo_losses)
+    )
+    advantage = gae(data["reward"], data["value"], args.gamma, args.gae_lambda)
     data = {**data, "advantage": advantage, "return": advantage + data["value"][:-1], "value": data["value"][:-1]}
     data = {name: x.flatten(0, 1) for name, x in data.items()}
     size, values = len(advantage.flatten()), {}
     for _ in range(args.update_epochs):
         for index in torch.randperm(size, device=advantage.device).tensor_split(args.num_minibatches):
-            losses = ppo_losses(agent, {name: x[index] for name, x in data.items()}, args)
+            losses = losses_of(agent, {name: x[index] for name, x in data.items()}, args)
             values = check_finite(losses, "a PPO update")
             if stop.received:
                 raise Stopped
@@ -704,7 +718,8 @@ def ppo_update(
                 return values
             optimizer.zero_grad()
             losses["total"].backward()
-            nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            norm = nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            check_finite({"gradient norm": norm}, "a PPO update")
             optimizer.step()
     return values
 
@@ -792,6 +807,8 @@ def train_ppo(
         optimizer.load_state_dict(checkpoint["optimizer"])
         first, rows = checkpoint["iteration"], checkpoint["rows"]
         print(f"going on with {path} at step {first * per_iteration:,}", flush=True)
+    if args.compile:
+        agent.compile()
     writer = SummaryWriter(path, purge_step=first * per_iteration)
     bar = tqdm(total=num_iterations * per_iteration, initial=first * per_iteration, desc="PPO", unit="step")
     saved = start = time.time()
@@ -866,6 +883,15 @@ def train_ppo(
         print("this was a --quick trial: the code ran, the numbers mean nothing")
 
 
+def track(args: "Args", path: Path) -> None:
+    """Send what TensorBoard gets to Weights & Biases too; fails when that is not installed."""
+    try:
+        import wandb
+    except ImportError:
+        fail("--track needs Weights & Biases, which is not installed; pip install wandb, or leave --track out")
+    wandb.init(project="aib", id=path.name, config=asdict(args), dir=path, sync_tensorboard=True, resume="allow")
+
+
 def evaluate_checkpoint(args: "Args", kind: str, build: Callable) -> None:
     """Evaluate agent.pt on its own task and robot; writes evaluation.json and evaluation.mp4 beside it."""
     file = args.checkpoint or Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}" / "agent.pt"
@@ -894,7 +920,7 @@ def build_aib(args: Args, envs: gym.vector.VectorEnv, stored: dict) -> tuple[Bel
     belief.requires_grad_(False)  # only the aggregator in the agent goes on learning
     seed_everything(args.seed)
     sizes = (space["joints"].shape[0], envs.single_action_space.shape[0], config["u_dim"])
-    agent = BeliefAgent(config["image_shape"], *sizes).to(device)
+    agent = BeliefAgent(config["image_shape"], *sizes, args.amp).to(device)
     look = partial(
         evaluate_with_belief,
         steps=envs.spec.max_episode_steps,
@@ -914,6 +940,8 @@ def main(args: Args) -> None:
         if (path / "summary.json").exists():
             print(f"{path} is finished; --overwrite makes it anew")
             return
+        if args.track:
+            track(args, path)
         file = args.belief or Path("runs") / f"{args.env_id}__aib_belief__{args.seed}" / "belief.pt"
         given = f"--env-id {args.env_id} --robot {args.robot} --seed {args.seed}"
         mend = f"make it anew with aib_belief.py {given} --overwrite, or name another with --belief"

@@ -38,7 +38,7 @@ ROWS = {
 BELIEVER = """
 import sys, tyro, ppo_believer as b
 args = b.resolve(tyro.cli(b.Args), b.PPO_DEFAULTS | b.BELIEF_DEFAULTS)
-args.amp = b.has_bfloat16(args.device)
+args.belief_amp = b.has_bfloat16(args.device)
 with b.run_directory(args) as path:
     (path / "belief.pt").exists() or b.make_belief(args, path, b.StopSignal())
 """

@@ -40,7 +40,15 @@ def belief_batch(steps: int = T) -> dict[str, torch.Tensor]:
 
 
 def losses_args(**changes: object) -> SimpleNamespace:
-    defaults = dict(bptt_steps=None, amp=False, beta=1.0, action_head="flow", fm_latent="sample", action_lambda=1.0)
+    defaults = dict(
+        bptt_steps=None,
+        amp=False,
+        belief_amp=False,
+        beta=1.0,
+        action_head="flow",
+        fm_latent="sample",
+        action_lambda=1.0,
+    )
     return SimpleNamespace(**{**defaults, **changes})
 
 
