@@ -1,0 +1,141 @@
+"""Kill every stage at many moments, go on each time, and compare with a run that was never interrupted.
+
+python tests/kill_table.py prints the table; test_resume.py runs a part of it.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).parent.parent
+SIZES = {
+    "aib_repr": dict(num_episodes=12, val_share=0.25, epochs=2, batch_size=30, num_workers=2, checkpoint_minutes=0),
+    "aib_belief": dict(num_updates=6, batch_episodes=4, held_out_every=2, checkpoint_minutes=0),
+    "ppo_aib": dict(total_timesteps=240, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
+    "ppo_baseline": dict(total_timesteps=240, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
+    "ppo_believer": dict(total_timesteps=160, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
+}
+for name in ("ppo_aib", "ppo_baseline", "ppo_believer"):
+    SIZES[name] |= dict(num_workers=4, update_epochs=2, gamma=0.99, checkpoint_minutes=0)
+SIZES["ppo_believer"] |= dict(num_updates=4, batch_episodes=4, held_out_every=2)
+
+KILLS = [  # script, what it was doing, the moment
+    ("aib_repr", "laying out the dataset", "create_dataset:1"),
+    ("aib_repr", "collecting, first round", "env.step:5"),
+    ("aib_repr", "collecting, third round", "env.step:27"),
+    ("aib_repr", "writing meta.json", "os.fsync:4"),
+    ("aib_repr", "stage 1, first update", "repr_losses:1"),
+    ("aib_repr", "stage 1, in an epoch", "repr_losses:5"),
+    ("aib_repr", "stage 1, held-out losses", "repr_losses:4"),
+    ("aib_repr", "writing a checkpoint", "os.replace:11"),
+    ("aib_repr", "stage 1, diagnostics", "diagnose_repr:1"),
+    ("aib_belief", "stage 2, first update", "belief_losses:1"),
+    ("aib_belief", "stage 2, fourth update", "belief_losses:4"),
+    ("aib_belief", "stage 2, held-out look", "encode:2"),
+    ("aib_belief", "flushing a checkpoint", "os.fsync:3"),
+    ("aib_belief", "stage 2, diagnostics", "diagnose_belief:1"),
+    ("aib_belief", "renaming belief.pt", "os.replace:10"),
+    ("ppo_aib", "PPO, first evaluation", "env.step:4"),
+    ("ppo_aib", "PPO, rollout", "env.step:45"),
+    ("ppo_aib", "PPO, update", "ppo_losses:11"),
+    ("ppo_aib", "PPO, encoding a video", "encode_video:2"),
+    ("ppo_aib", "PPO, flushing a checkpoint", "os.fsync:6"),
+    ("ppo_aib", "PPO, renaming eval.csv", "os.replace:7"),
+    ("ppo_believer", "Believer, its belief", "believer_losses:3"),
+    ("ppo_believer", "Believer, PPO update", "ppo_losses:9"),
+    ("ppo_baseline", "plain PPO, second rollout", "env.step:62"),
+]
+
+
+def start(script: str, folder: Path, moment: str | None = None) -> int:
+    """Run a script on the toy task in folder, to be killed at a moment; the exit code."""
+    command = [sys.executable, str(ROOT / "tests" / "toy_run.py"), script, json.dumps(SIZES[script])]
+    return subprocess.run(command + ([moment] if moment else []), cwd=folder, capture_output=True).returncode
+
+
+def results(folder: Path) -> dict[str, object]:
+    """All that a finished run must repeat to the last bit: weights, evaluations, dataset."""
+    found = {}
+    for file in sorted(folder.rglob("*")):
+        name = str(file.relative_to(folder))
+        if file.suffix == ".npy":
+            found[name] = np.load(file).tobytes()
+        elif file.suffix == ".csv" or file.name in ("diagnostics.json", "summary.json", "meta.json"):
+            found[name] = file.read_bytes()
+        elif file.suffix == ".pt" and "checkpoint" not in file.name:
+            found[name] = flatten(torch.load(file, weights_only=True))
+    return found
+
+
+def flatten(x: object) -> object:
+    """Nested dictionaries and lists with tensors as bytes, so that == compares them exactly."""
+    if isinstance(x, dict):
+        return {name: flatten(value) for name, value in x.items()}
+    if isinstance(x, list):
+        return [flatten(value) for value in x]
+    return x.numpy().tobytes() if isinstance(x, torch.Tensor) else x
+
+
+def readable(folder: Path) -> bool:
+    """Whether every file of the folder that has its final name can be read."""
+    for file in folder.rglob("*"):
+        if file.suffix == ".pt":
+            torch.load(file, weights_only=True)
+        elif file.suffix == ".json":
+            json.loads(file.read_text())
+        elif file.suffix == ".csv":
+            assert len({line.count(",") for line in file.read_text().splitlines()}) == 1
+    return True
+
+
+def before(script: str, reference: Path, folder: Path) -> None:
+    """Give folder the finished earlier stages of the reference run that a script reads."""
+    needs = {"aib_belief": ["aib_repr"], "ppo_aib": ["aib_belief"], "ppo_believer": ["aib_repr"]}
+    (folder / "runs").mkdir()
+    for stage in needs.get(script, []):
+        (folder / "runs" / f"ToyMemory-v0__{stage}__1").symlink_to(reference / "runs" / f"ToyMemory-v0__{stage}__1")
+
+
+def make_reference(folder: Path, scripts: set[str]) -> None:
+    """Run the scripts without interruption, the earlier stages first."""
+    for script in SIZES:
+        if script in scripts or script in ("aib_repr", "aib_belief"):
+            assert start(script, folder) == 0, script
+
+
+def kill_and_go_on(script: str, moment: str, reference: Path, folder: Path) -> dict[str, bool]:
+    """Kill a script at a moment, look at its files, run it again, compare with the reference."""
+    before(script, reference, folder)
+    killed = start(script, folder, moment) == -9
+    run = Path("runs") / f"ToyMemory-v0__{script}__1"
+    whole = readable(folder / run)
+    finished = start(script, folder) == 0
+    same = finished and results(folder / run) == results(reference / run)
+    return {"killed": killed, "files whole": whole, "finished": finished, "bit-identical": same}
+
+
+def main() -> None:
+    """Print the table; exit code 1 when a row fails."""
+    with tempfile.TemporaryDirectory() as name:
+        reference = Path(name) / "reference"
+        reference.mkdir()
+        make_reference(reference, {script for script, _, _ in KILLS})
+        print(f"{'while':32} {'killed at':22} killed  files whole  finished  bit-identical")
+        good = True
+        for number, (script, doing, moment) in enumerate(KILLS):
+            folder = Path(name) / str(number)
+            folder.mkdir()
+            row = kill_and_go_on(script, moment, reference, folder)
+            good &= all(row.values())
+            cells = "  ".join(f"{'yes' if value else 'NO':>{len(key)}}" for key, value in row.items())
+            print(f"{doing:32} {moment:22} {cells}", flush=True)
+    sys.exit(not good)
+
+
+if __name__ == "__main__":
+    main()
