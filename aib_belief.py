@@ -484,12 +484,12 @@ def write_report(report: dict, path: Path, title: str, writer: SummaryWriter, up
 
 def fail(message: str, code: int = 2) -> NoReturn:
     """Say on stderr, in one sentence, what is wrong and how to mend it, and leave (exit code 2: bad input)."""
-    print(f"error: {message}", file=sys.stderr, flush=True)
+    tqdm.write(f"error: {message}", file=sys.stderr)  # on a line of its own, below any progress bar
     sys.exit(code)
 
 
 def resolve(args: "Args", defaults: dict) -> "Args":
-    """Fill in the arguments left out, so that args.json shows what was used; fails when CUDA is wanted and absent."""
+    """Fill in the arguments left out, so that args.json shows what was used; fails on what can only be a slip."""
     has_cuda = torch.cuda.is_available()
     if not has_cuda and "cuda" in (args.device or "") + (args.sim_backend or ""):
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu or leave both out")
@@ -499,6 +499,10 @@ def resolve(args: "Args", defaults: dict) -> "Args":
     for name, value in defaults.items():
         if getattr(args, name) is None:
             setattr(args, name, value)
+    for name, value in asdict(args).items():
+        least = 0 if isinstance(value, bool | float) or name == "seed" else 1
+        if isinstance(value, int | float) and not value >= least:
+            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     return args
 
 
@@ -657,8 +661,9 @@ def check_same(path: Path, made: dict, args: "Args", mend: str) -> None:
 def load_episodes(repr_dir: Path, args: "Args", device: torch.device) -> tuple[Episodes, dict, torch.Tensor, dict]:
     """Open stage 1's output, made first where missing: episodes with u = mean of phi(s), sizes, cue (N, K), repr.pt."""
     data, file = repr_dir / "dataset", repr_dir / "repr.pt"
+    usual = Path("runs") / f"{args.env_id}__aib_repr__{args.seed}"
     mend = f"make it anew with aib_repr.py --env-id {args.env_id} --robot {args.robot} --seed {args.seed} --overwrite"
-    if not file.exists():
+    if not file.exists() and repr_dir == usual:
         run_stage("aib_repr.py", args, file)
     stored = load(file, "repr", mend)
     meta, arrays = open_dataset(data, mend)

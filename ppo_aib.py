@@ -133,12 +133,12 @@ PPO_QUICK = dict(robot="panda", total_timesteps=720, num_envs=4, eval_every=2, n
 
 def fail(message: str, code: int = 2) -> NoReturn:
     """Say on stderr, in one sentence, what is wrong and how to mend it, and leave (exit code 2: bad input)."""
-    print(f"error: {message}", file=sys.stderr, flush=True)
+    tqdm.write(f"error: {message}", file=sys.stderr)  # on a line of its own, below any progress bar
     sys.exit(code)
 
 
 def resolve(args: "Args", defaults: dict) -> "Args":
-    """Fill in the arguments left out, so that args.json shows what was used; fails when CUDA is wanted and absent."""
+    """Fill in the arguments left out, so that args.json shows what was used; fails on what can only be a slip."""
     has_cuda = torch.cuda.is_available()
     if not has_cuda and "cuda" in (args.device or "") + (args.sim_backend or ""):
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu or leave both out")
@@ -148,6 +148,10 @@ def resolve(args: "Args", defaults: dict) -> "Args":
     for name, value in defaults.items():
         if getattr(args, name) is None:
             setattr(args, name, value)
+    for name, value in asdict(args).items():
+        least = 0 if isinstance(value, bool | float) or name == "seed" else 1
+        if isinstance(value, int | float) and not value >= least:
+            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     return args
 
 
@@ -945,7 +949,7 @@ def main(args: Args) -> None:
         file = args.belief or Path("runs") / f"{args.env_id}__aib_belief__{args.seed}" / "belief.pt"
         given = f"--env-id {args.env_id} --robot {args.robot} --seed {args.seed}"
         mend = f"make it anew with aib_belief.py {given} --overwrite, or name another with --belief"
-        if not file.exists():
+        if not file.exists() and args.belief is None:
             run_stage("aib_belief.py", args, file)
         stored = load(file, "aib_belief", mend)
         check_same(file, stored, args, mend)

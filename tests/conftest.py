@@ -7,9 +7,12 @@ from pathlib import Path
 
 import pytest
 
+import aib_belief
+import aib_repr
+import toy
+
 ROOT = Path(__file__).parent.parent
 SCRIPTS = ("aib_repr", "aib_belief", "ppo_aib", "ppo_believer", "ppo_baseline")
-sys.path.insert(0, str(ROOT))
 os.environ["TQDM_MININTERVAL"] = "30"
 
 
@@ -31,3 +34,15 @@ def quick_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert code == 0, out + err
         assert "mean nothing" in out
     return folder
+
+
+@pytest.fixture(scope="session")
+def toy_stages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A runs folder with a barely trained stage 1 and stage 2 of the toy task."""
+    folder = tmp_path_factory.mktemp("stages")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(aib_repr, "make_envs", toy.make_envs)
+        aib_repr.main(aib_repr.Args(env_id="ToyMemory-v0", num_episodes=20, epochs=1, batch_size=50))
+        aib_belief.main(aib_belief.Args(env_id="ToyMemory-v0", num_updates=3, batch_episodes=4))
+    return folder / "runs"

@@ -14,14 +14,14 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 SIZES = {
-    "aib_repr": dict(num_episodes=12, val_share=0.25, epochs=2, batch_size=30, num_workers=2, checkpoint_minutes=0),
-    "aib_belief": dict(num_updates=6, batch_episodes=4, held_out_every=2, checkpoint_minutes=0),
+    "aib_repr": dict(num_episodes=12, val_share=0.25, epochs=2, batch_size=30, num_workers=2, checkpoint_minutes=0.0),
+    "aib_belief": dict(num_updates=6, batch_episodes=4, held_out_every=2, checkpoint_minutes=0.0),
     "ppo_aib": dict(total_timesteps=240, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
     "ppo_baseline": dict(total_timesteps=240, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
     "ppo_believer": dict(total_timesteps=160, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
 }
 for name in ("ppo_aib", "ppo_baseline", "ppo_believer"):
-    SIZES[name] |= dict(num_workers=4, update_epochs=2, gamma=0.99, checkpoint_minutes=0)
+    SIZES[name] |= dict(num_workers=4, update_epochs=2, gamma=0.99, checkpoint_minutes=0.0)
 SIZES["ppo_believer"] |= dict(num_updates=4, batch_episodes=4, held_out_every=2)
 
 KILLS = [  # script, what it was doing, the moment

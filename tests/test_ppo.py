@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-import aib_belief
 import aib_repr
 import ppo_aib
 import ppo_baseline
@@ -28,37 +27,25 @@ def toy_task(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "make_envs", toy.make_envs)
 
 
-@pytest.fixture(scope="module")
-def stages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a barely trained stage 1, stage 2 and Believer's belief, as absolute path."""
-    folder = tmp_path_factory.mktemp("stages")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setattr(aib_repr, "make_envs", toy.make_envs)
-        aib_repr.main(aib_repr.Args(env_id=TASK, num_episodes=20, epochs=1, batch_size=50))
-        aib_belief.main(aib_belief.Args(env_id=TASK, num_updates=3, batch_episodes=4))
-    return folder / "runs"
-
-
-def arguments(module: ModuleType, stages: Path, **changes: object) -> object:
-    """Arguments of a small run of a method on the stages made above."""
-    more = {"belief": stages / f"{TASK}__aib_belief__1" / "belief.pt"} if module is ppo_aib else {}
+def arguments(module: ModuleType, toy_stages: Path, **changes: object) -> object:
+    """Arguments of a small run of a method on the toy stages of conftest."""
+    more = {"belief": toy_stages / f"{TASK}__aib_belief__1" / "belief.pt"} if module is ppo_aib else {}
     if module is ppo_believer:
-        more = {"repr_dir": stages / f"{TASK}__aib_repr__1", "num_updates": 3, "batch_episodes": 4}
+        more = {"repr_dir": toy_stages / f"{TASK}__aib_repr__1", "num_updates": 3, "batch_episodes": 4}
     return module.Args(**{**SMALL, **more, **changes})
 
 
-def played(stages: Path, explore: bool = True) -> tuple:
+def played(toy_stages: Path, explore: bool = True) -> tuple:
     """An AIB agent and what it gathered in one iteration of the toy task."""
-    args = ppo_aib.resolve(arguments(ppo_aib, stages), ppo_aib.PPO_DEFAULTS)
+    args = ppo_aib.resolve(arguments(ppo_aib, toy_stages), ppo_aib.PPO_DEFAULTS)
     stored = torch.load(args.belief, weights_only=True)
     envs = toy.make_envs(args, 8)
     agent, play, _ = ppo_aib.build_aib(args, envs, stored)
     return args, agent, ppo_aib.gather(play(np.arange(8), explore), 10, 8)
 
 
-def test_the_ratio_starts_at_one_because_the_particles_are_kept(stages: Path) -> None:
-    args, agent, data = played(stages)
+def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path) -> None:
+    args, agent, data = played(toy_stages)
     batch = {name: x[: len(data["reward"])].flatten(0, 1) for name, x in data.items()}
 
     def ratio(particles: torch.Tensor) -> torch.Tensor:
@@ -70,8 +57,8 @@ def test_the_ratio_starts_at_one_because_the_particles_are_kept(stages: Path) ->
     assert (ratio(fresh) - 1).abs().max() > 1e-4, "fresh draws would not do"
 
 
-def test_rollout_arrays(stages: Path) -> None:
-    _, _, data = played(stages)
+def test_rollout_arrays(toy_stages: Path) -> None:
+    _, _, data = played(toy_stages)
     shapes = {name: (tuple(x.shape), x.dtype) for name, x in data.items()}
     assert shapes == {
         "rgb": ((10, 8, 36, 36, 3), torch.uint8),
@@ -92,8 +79,8 @@ def test_images_of_the_default_intercept_rollout_fit_in_1_2_gb() -> None:
 
 
 @pytest.mark.parametrize("target_kl, steps", [(-1.0, 0), (1e9, 2 * 4)])
-def test_the_update_ends_at_the_kl_target(stages: Path, target_kl: float, steps: int) -> None:
-    args, agent, data = played(stages)
+def test_the_update_ends_at_the_kl_target(toy_stages: Path, target_kl: float, steps: int) -> None:
+    args, agent, data = played(toy_stages)
     args.target_kl, taken = target_kl, []
     optimizer = torch.optim.SGD(agent.parameters(), lr=1e-3)
     optimizer.register_step_post_hook(lambda *_: taken.append(1))
@@ -102,14 +89,14 @@ def test_the_update_ends_at_the_kl_target(stages: Path, target_kl: float, steps:
 
 
 def test_belief_is_frozen_and_the_aggregator_learns(
-    stages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    toy_stages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for script, name in (("ppo_aib", "aib_belief"), ("ppo_believer", "ppo_believer")):
         module = METHODS[script]
-        module.main(arguments(module, stages))
+        module.main(arguments(module, toy_stages))
         trained = torch.load(f"runs/{TASK}__{script}__1/agent.pt", weights_only=True)
-        folder = stages if script == "ppo_aib" else Path("runs")
+        folder = toy_stages if script == "ppo_aib" else Path("runs")
         before = torch.load(folder / f"{TASK}__{name}__1" / "belief.pt", weights_only=True)["weights"]
         assert all(torch.equal(trained["weights"][key], value) for key, value in before.items())
         module.seed_everything(1)
@@ -120,12 +107,12 @@ def test_belief_is_frozen_and_the_aggregator_learns(
 
 @pytest.mark.parametrize("script", METHODS)
 def test_any_number_of_workers_gives_the_same_training_and_evaluation(
-    stages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str
+    toy_stages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     results = {}
     for workers in (1, 2, 4):
-        args = arguments(METHODS[script], stages, num_workers=workers, exp_name=f"workers_{workers}")
+        args = arguments(METHODS[script], toy_stages, num_workers=workers, exp_name=f"workers_{workers}")
         METHODS[script].main(args)
         path = Path("runs") / f"{TASK}__workers_{workers}__1"
         rows = list(csv.DictReader((path / "eval.csv").open()))
