@@ -1,0 +1,216 @@
+"""Tables 1, 6, 7, 8 and Figures 2, 3, 4, 8 of the paper from finished runs, beside the paper's own numbers.
+
+Usage:   python benchmark/report.py                 (reads runs/, writes benchmark/report/)
+         python benchmark/report.py --runs results --output report
+Reads:   {runs}/{env_id}__{exp_name}__{seed}/ of the PPO scripts: args.json, eval.csv, summary.json if finished
+Writes:  {output}/report.md and PNG figures
+"""
+
+import csv
+import json
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import tyro
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+TASKS = {
+    "RememberShapeAndColor3x2-v0": "RSC3x2",
+    "RememberColor9-v0": "RC9",
+    "InterceptMedium-v0": "IMed",
+    "InterceptFast-v0": "IFast",
+}
+METHODS = {"ppo_aib": "AIB", "ppo_believer": "Believer", "ppo_baseline": "PPO"}
+COLOURS = {"ppo_aib": "tab:red", "ppo_believer": "tab:blue", "ppo_baseline": "tab:green"}
+HEADS = {"ppo_aib": "flow matching", "ppo_aib_none": "no action head", "ppo_aib_mse": "MSE regression"}
+LAMBDAS = {"ppo_aib": "λ = 1", "ppo_aib_lambda_0.1": "λ = 0.1", "ppo_aib_lambda_0.01": "λ = 0.01"}
+PAPER = {  # (column of eval.csv, statistic): {task: (AIB, Believer, PPO)}
+    ("success_once", "last"): {
+        "RSC3x2": ("0.82 ± 0.04", "0.76 ± 0.02", "0.04 ± 0.02"),
+        "RC9": ("0.36 ± 0.07", "0.35 ± 0.03", "0.17 ± 0.03"),
+        "IMed": ("0.54 ± 0.06", "0.56 ± 0.10", "0.70 ± 0.14"),
+        "IFast": ("0.67 ± 0.07", "0.52 ± 0.14", "0.01 ± 0.01"),
+    },
+    ("success_at_end", "last"): {
+        "RSC3x2": ("0.81 ± 0.03", "0.74 ± 0.04", "0.01 ± 0.01"),
+        "RC9": ("0.25 ± 0.06", "0.21 ± 0.01", "0.10 ± 0.01"),
+        "IMed": ("0.17 ± 0.04", "0.11 ± 0.03", "0.02 ± 0.02"),
+        "IFast": ("0.09 ± 0.03", "0.08 ± 0.02", "0.00 ± 0.00"),
+    },
+    ("success_once", "max"): {
+        "RSC3x2": ("0.87 ± 0.01", "0.82 ± 0.01", "0.14 ± 0.03"),
+        "RC9": ("0.41 ± 0.08", "0.38 ± 0.03", "0.20 ± 0.02"),
+        "IMed": ("0.68 ± 0.01", "0.65 ± 0.07", "0.71 ± 0.13"),
+        "IFast": ("0.77 ± 0.06", "0.69 ± 0.12", "0.02 ± 0.02"),
+    },
+    ("success_at_end", "max"): {
+        "RSC3x2": ("0.86 ± 0.01", "0.80 ± 0.02", "0.04 ± 0.01"),
+        "RC9": ("0.28 ± 0.05", "0.23 ± 0.02", "0.15 ± 0.02"),
+        "IMed": ("0.23 ± 0.02", "0.18 ± 0.03", "0.03 ± 0.01"),
+        "IFast": ("0.14 ± 0.01", "0.12 ± 0.02", "0.00 ± 0.00"),
+    },
+}
+TITLES = {
+    ("success_once", "last"): "Table 1: success_once, mean of the last three evaluations",
+    ("success_at_end", "last"): "Table 6: success_at_end, mean of the last three evaluations",
+    ("success_once", "max"): "Table 7: success_once, maximum over evaluations",
+    ("success_at_end", "max"): "Table 8: success_at_end, maximum over evaluations",
+}
+PAPER_LAMBDAS = {
+    "ppo_aib": "0.666 ± 0.072",
+    "ppo_aib_lambda_0.1": "0.623 ± 0.081",
+    "ppo_aib_lambda_0.01": "0.446 ± 0.011",
+}
+
+
+@dataclass
+class Args:
+    runs: Path = Path("runs")
+    """folder of run directories"""
+    output: Path = Path("benchmark/report")
+    """folder for report.md and the figures"""
+
+
+@dataclass
+class Run:
+    """One seed: the columns of eval.csv as arrays, and whether the run is finished."""
+
+    seed: int
+    finished: bool
+    quick: bool
+    share: float
+    columns: dict[str, np.ndarray]
+
+
+def read_runs(folder: Path) -> dict[tuple[str, str], list[Run]]:
+    """Every run with an eval.csv below folder, by task and experiment name, seeds in order."""
+    runs = defaultdict(list)
+    for file in sorted(folder.glob("*__*__*/eval.csv")):
+        args = json.loads((file.parent / "args.json").read_text())
+        rows = list(csv.DictReader(file.open()))
+        columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        share = columns["global_step"][-1] / args["total_timesteps"]
+        finished = (file.parent / "summary.json").exists()
+        runs[args["env_id"], args["exp_name"]].append(Run(args["seed"], finished, args["quick"], share, columns))
+    return {key: sorted(found, key=lambda run: run.seed) for key, found in runs.items()}
+
+
+def statistic(run: Run, column: str, which: str) -> float:
+    """The paper's summary of one run: mean of the last three evaluations, or the maximum."""
+    values = run.columns[column]
+    return float(values[-3:].mean() if which == "last" else values.max())
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Mean of the middle half of the values; runs at the edge of it count in part."""
+    values, quarter = np.sort(values), len(values) / 4
+    places = np.arange(len(values))
+    weights = np.clip(np.minimum(places + 1, len(values) - quarter) - np.maximum(places, quarter), 0, 1)
+    return float((weights * values).sum() / weights.sum())
+
+
+def summarise(values: list[float]) -> str:
+    """Mean ± sample standard deviation over seeds; from three on also the interquartile mean with a 95 % interval."""
+    x = np.array(values)
+    if len(x) == 1:
+        return f"{x[0]:.2f} (1 seed)"
+    text = f"{x.mean():.2f} ± {x.std(ddof=1):.2f} ({len(x)} seeds)"
+    if len(x) > 2:
+        rng = np.random.default_rng(0)
+        low, high = np.quantile([interquartile_mean(rng.choice(x, len(x))) for _ in range(2000)], [0.025, 0.975])
+        text += f", IQM {interquartile_mean(x):.2f} [{low:.2f}, {high:.2f}]"
+    return text
+
+
+def cell(runs: list[Run] | None, column: str, which: str) -> str:
+    """What the table says of one task and method: numbers, and what is missing, unfinished or only a trial."""
+    if not runs:
+        return "missing"
+    done = [statistic(run, column, which) for run in runs if run.finished and not run.quick]
+    notes = [f"seed {run.seed} unfinished ({run.share:.0%})" for run in runs if not run.finished]
+    notes += [f"seed {run.seed} is a --quick trial" for run in runs if run.finished and run.quick]
+    return "; ".join(([summarise(done)] if done else []) + notes)
+
+
+def main_table(runs: dict, key: tuple[str, str]) -> str:
+    """One of the paper's four tables in Markdown, ours beside the paper's."""
+    head = "| task | " + " | ".join(f"{name} | {name} (paper's)" for name in METHODS.values()) + " |"
+    lines = [f"## {TITLES[key]}", "", head, "|" + "---|" * 7]
+    for task, short in TASKS.items():
+        cells = [(cell(runs.get((task, name)), *key), PAPER[key][short][i]) for i, name in enumerate(METHODS)]
+        lines.append(f"| {short} | " + " | ".join(f"{ours} | {paper}" for ours, paper in cells) + " |")
+    return "\n".join(lines)
+
+
+def variant_table(runs: dict, title: str, variants: dict[str, str], paper: dict[str, str]) -> str:
+    """An ablation on InterceptFast-v0: success_once, mean of the last three evaluations."""
+    lines = [f"## {title}", "", "| variant | success_once | paper's |", "|---|---|---|"]
+    for name, label in variants.items():
+        ours = cell(runs.get(("InterceptFast-v0", name)), "success_once", "last")
+        lines.append(f"| {label} | {ours} | {paper.get(name, 'only a figure')} |")
+    return "\n".join(lines)
+
+
+def draw(axes: plt.Axes, runs: list[Run] | None, column: str, label: str, colour: str | None) -> None:
+    """One learning curve: mean over seeds at the steps all of them have, shaded by the standard deviation."""
+    if not runs:
+        axes.plot([], [], color=colour, label=f"{label} (missing)")
+        return
+    length = min(len(run.columns["global_step"]) for run in runs)
+    steps = runs[0].columns["global_step"][:length]
+    values = np.stack([run.columns[column][:length] for run in runs])
+    unfinished = "" if all(run.finished for run in runs) else ", unfinished"
+    (line,) = axes.plot(steps, values.mean(0), color=colour, label=f"{label} ({len(runs)} seeds{unfinished})")
+    if len(runs) > 1:
+        spread = values.std(0, ddof=1)
+        axes.fill_between(steps, values.mean(0) - spread, values.mean(0) + spread, color=line.get_color(), alpha=0.2)
+
+
+def finish(figure: plt.Figure, axes: np.ndarray, column: str, path: Path) -> None:
+    """Label the axes and save the figure."""
+    for ax in axes:
+        ax.set(xlabel="environment steps", ylabel=column, ylim=(-0.02, 1.02))
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main(args: Args) -> None:
+    """Write the report; fails with one sentence when there is no run to report on."""
+    runs = read_runs(args.runs)
+    if not runs:
+        print(f"error: no eval.csv below {args.runs}; name the folder of run directories with --runs", file=sys.stderr)
+        sys.exit(2)
+    args.output.mkdir(parents=True, exist_ok=True)
+    for column, name in (("success_once", "figure_2.png"), ("success_at_end", "figure_8.png")):
+        figure, axes = plt.subplots(1, 4, figsize=(18, 4), layout="constrained")
+        for ax, (task, short) in zip(axes, TASKS.items(), strict=True):
+            for method, label in METHODS.items():
+                draw(ax, runs.get((task, method)), column, label, COLOURS[method])
+            ax.set_title(short)
+        finish(figure, axes, column, args.output / name)
+    for variants, name in ((HEADS, "figure_3.png"), (LAMBDAS, "figure_4.png")):
+        figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")
+        for method, label in variants.items():
+            draw(ax, runs.get(("InterceptFast-v0", method)), "success_once", label, None)
+        ax.set_title("InterceptFast-v0")
+        finish(figure, [ax], "success_once", args.output / name)
+    parts = ["# Report", "Columns marked (paper's) are the paper's numbers, all others were measured in these runs."]
+    parts += [main_table(runs, key) for key in TITLES]
+    parts += ["![success_once](figure_2.png)", "![success_at_end](figure_8.png)"]
+    parts += [variant_table(runs, "Figure 3: action heads on InterceptFast-v0", HEADS, {}), "![heads](figure_3.png)"]
+    parts += [variant_table(runs, "Figure 4: weight of the flow loss on InterceptFast-v0", LAMBDAS, PAPER_LAMBDAS)]
+    parts += ["![weights](figure_4.png)"]
+    (args.output / "report.md").write_text("\n\n".join(parts) + "\n")
+    print(f"{args.output / 'report.md'}: {sum(map(len, runs.values()))} runs")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,39 @@
+#!/bin/bash
+#SBATCH --job-name=aib
+#SBATCH --gpus=1
+#SBATCH --cpus-per-task=16
+#SBATCH --mem=64G
+#SBATCH --time=12:00:00
+#SBATCH --requeue
+#SBATCH --signal=B:USR1@120
+#SBATCH --output=runs/slurm-%x-%A_%a.log
+#
+# Submit all of the paper's experiments with one line, from the repository's root:   bash benchmark/slurm.sh
+# Three job arrays follow one another: stage 1, the beliefs, PPO. A job that is preempted or runs into its time limit
+# saves, is queued again and goes on. Change the lines above to what your cluster wants.
+set -euo pipefail
+
+if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
+    mkdir -p runs
+    after=
+    for phase in 1 2 3; do
+        count=$(.venv/bin/python benchmark/experiments.py --dry-run --phase "$phase" | wc -l)
+        job=$(sbatch --parsable --array="0-$((count - 1))" $after --export="ALL,PHASE=$phase" "$0")
+        echo "phase $phase: $count jobs, array $job"
+        after="--dependency=afterok:$job"
+    done
+    exit 0
+fi
+
+.venv/bin/python benchmark/experiments.py --phase "$PHASE" --index "$SLURM_ARRAY_TASK_ID" &
+child=$!
+stopped=
+# the script saves on SIGUSR1 and leaves with code 0; then the job goes back into the queue
+trap 'stopped=yes; pkill -USR1 -P "$child"' USR1
+code=0
+wait "$child" || code=$?
+if [ -n "$stopped" ]; then
+    wait "$child" || code=$?
+    scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"
+fi
+exit "$code"
