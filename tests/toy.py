@@ -10,7 +10,8 @@ class ToyMemory(gym.vector.VectorEnv):
     """See a colour for two steps, nothing for six, and then act on it.
 
     Three colours name three targets of the first action. The last two of ten steps are rewarded by closeness to the
-    target, and only the last one can succeed. All that happens follows from an episode's seed and the actions.
+    target, and only the last one can succeed, by being nearest to the right target: without memory the chance is one
+    third, whatever one does. All that happens follows from an episode's seed and the actions.
     """
 
     STEPS, CUE, GO, SIZE = 10, 2, 8, 36
@@ -35,7 +36,7 @@ class ToyMemory(gym.vector.VectorEnv):
         phase = np.full((self.num_envs, 1), self.t / self.STEPS, np.float32)
         obs = {"rgb": rgb, "joints": np.concatenate([self.body, phase], 1)}
         one_hot = np.eye(3, dtype=np.float32)[self.colour]
-        success = np.abs(self.action - self.TARGETS[self.colour]) < 0.3
+        success = np.abs(self.action[:, None] - self.TARGETS).argmin(1) == self.colour
         info = {"success": (success & (self.t == self.STEPS)).astype(np.float32)}
         info |= {"state": np.concatenate([one_hot, phase], 1), "cue": self.colour[:, None].astype(np.float32)}
         return obs, info
