@@ -192,8 +192,8 @@ def run_directory(args: "Args") -> Iterator[Path]:
         fail(f"{path} cannot be written ({error.strerror}); run from a folder where you may write")
     try:
         if args.overwrite:
-            for old in path.iterdir():
-                shutil.rmtree(old) if old.is_dir() else old.name == "lock" or old.unlink()
+            for old in set(path.iterdir()) - {path / "lock"}:
+                shutil.rmtree(old) if old.is_dir() else old.unlink()
         record = path / "args.json"
         try:
             made_with = json.loads(record.read_text()) if record.exists() else wanted
@@ -235,9 +235,8 @@ def seed_everything(seed: int, *counter: int) -> None:
 
 def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]:
     """Turn loss terms into numbers; one that is not finite ends the run with exit code 1 and leaves the checkpoint."""
-    values = dict(
-        zip(terms, torch.stack([x.detach() for x in terms.values()]).tolist(), strict=True)
-    )  # one wait for the GPU
+    numbers = torch.stack([x.detach() for x in terms.values()]).tolist()  # all at once: one wait for the GPU
+    values = dict(zip(terms, numbers, strict=True))
     for name, value in values.items():
         if not math.isfinite(value):
             fail(f"{name} is {value} at {where}; the last checkpoint is kept: try a lower --learning-rate", code=1)

@@ -151,9 +151,10 @@ class Args:
 
 BELIEF_DEFAULTS = dict(num_updates=10_000, batch_episodes=256)
 BELIEF_QUICK = dict(num_updates=4, batch_episodes=4)
-PPO_DEFAULTS = dict(
-    robot="panda_wristcam", total_timesteps=10_000_000, num_envs=256, update_epochs=2, gamma=0.99
-) | dict(eval_every=25, num_eval_episodes=192)
+PPO_DEFAULTS = {
+    **dict(robot="panda_wristcam", total_timesteps=10_000_000, num_envs=256, update_epochs=2, gamma=0.99),
+    **dict(eval_every=25, num_eval_episodes=192),
+}
 TASKS = {  # Table 5, where it differs from PPO_DEFAULTS
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
@@ -252,8 +253,8 @@ def run_directory(args: "Args") -> Iterator[Path]:
         fail(f"{path} cannot be written ({error.strerror}); run from a folder where you may write")
     try:
         if args.overwrite:
-            for old in path.iterdir():
-                shutil.rmtree(old) if old.is_dir() else old.name == "lock" or old.unlink()
+            for old in set(path.iterdir()) - {path / "lock"}:
+                shutil.rmtree(old) if old.is_dir() else old.unlink()
         record = path / "args.json"
         try:
             made_with = json.loads(record.read_text()) if record.exists() else wanted
@@ -299,9 +300,8 @@ def seed_everything(seed: int, *counter: int) -> None:
 
 def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]:
     """Turn loss terms into numbers; one that is not finite ends the run with exit code 1 and leaves the checkpoint."""
-    values = dict(
-        zip(terms, torch.stack([x.detach() for x in terms.values()]).tolist(), strict=True)
-    )  # one wait for the GPU
+    numbers = torch.stack([x.detach() for x in terms.values()]).tolist()  # all at once: one wait for the GPU
+    values = dict(zip(terms, numbers, strict=True))
     for name, value in values.items():
         if not math.isfinite(value):
             fail(f"{name} is {value} at {where}; the last checkpoint is kept: try a lower --learning-rate", code=1)
@@ -967,9 +967,9 @@ def ppo_update(
     agent: nn.Module, optimizer: torch.optim.Optimizer, data: dict[str, torch.Tensor], args: "Args", stop: StopSignal
 ) -> dict[str, float]:
     """Update the agent on what gather stored, until the last epoch or the KL target; returns the last losses."""
-    gae, losses_of = (
-        (torch.compile(compute_gae), torch.compile(ppo_losses)) if args.compile else (compute_gae, ppo_losses)
-    )
+    gae, losses_of = compute_gae, ppo_losses
+    if args.compile:
+        gae, losses_of = torch.compile(gae), torch.compile(losses_of)
     advantage = gae(data["reward"], data["value"], args.gamma, args.gae_lambda)
     data = {**data, "advantage": advantage, "return": advantage + data["value"][:-1], "value": data["value"][:-1]}
     data = {name: x.flatten(0, 1) for name, x in data.items()}
