@@ -1,0 +1,71 @@
+"""Stage 2 as a whole: what it costs, and that it is the same computation as the slow way."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import aib_belief
+import aib_repr
+from conftest import ROOT
+from per_step_loop import PerStepHistory
+
+TASK = "ToyMemory-v0"
+
+
+def test_whole_sequences_give_what_a_per_step_loop_gives() -> None:
+    torch.manual_seed(0)
+    config = {"image_shape": [36, 36, 3], "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
+    history = aib_belief.HistoryEncoder(config)
+    batch = {"rgb": torch.randint(0, 256, (8, 3, 36, 36, 3), dtype=torch.uint8)}
+    assert torch.allclose(history(batch)[0], PerStepHistory(history)(batch)[0], atol=1e-5)
+    low = history(batch, amp=True)[0]
+    assert low.dtype == torch.float32 and torch.allclose(low, history(batch)[0], atol=0.05), "bfloat16 only roughly"
+
+
+def make_stage_1(folder: Path, episodes: int) -> int:
+    """Write a stage 1 of random numbers with 128 x 128 images; the bytes of its images."""
+    path = folder / "runs" / f"{TASK}__aib_repr__1"
+    path.mkdir(parents=True)
+    args = aib_repr.Args(env_id=TASK, robot="panda_wristcam", num_episodes=episodes)
+    shapes = {"rgb": ((episodes, 11, 128, 128, 3), np.uint8), "joints": ((episodes, 11, 3), np.float32)}
+    shapes |= {"state": ((episodes, 11, 4), np.float32), "actions": ((episodes, 10, 2), np.float32)}
+    shapes |= {"cue": ((episodes, 1), np.float32)}
+    aib_repr.create_dataset(path / "dataset", args, shapes)
+    meta, arrays = aib_repr.open_dataset(path / "dataset", "", mode="r+")
+    rng = np.random.default_rng(0)
+    for episode in range(episodes):
+        arrays["rgb"][episode] = rng.integers(0, 256, shapes["rgb"][0][1:], dtype=np.uint8)
+        arrays["state"][episode] = rng.normal(size=(11, 4))
+        arrays["cue"][episode] = rng.integers(3)
+    meta["episodes_done"] = episodes
+    (path / "dataset" / "meta.json").write_text(json.dumps(meta))
+    content = {"kind": "repr", "env_id": TASK, "robot": "panda_wristcam", "quick": False, "num_episodes": episodes}
+    content |= {"num_val": 8, "state_dim": 4, "u_dim": 4, "phi": aib_repr.StateEncoder(4, 4).state_dict()}
+    aib_repr.save(path / "repr.pt", content)
+    return arrays["rgb"].nbytes
+
+
+@pytest.mark.slow
+def test_peak_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path) -> None:
+    peaks, sizes = [], []
+    for episodes in (40, 800):
+        folder = tmp_path / str(episodes)
+        sizes.append(make_stage_1(folder, episodes))
+        code = (
+            "import sys, resource, aib_belief as b; b.main(b.Args(env_id=sys.argv[1], num_updates=3, batch_episodes=8))"
+        )
+        code += "; print('PEAK', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)"
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run([sys.executable, "-c", code, TASK], cwd=folder, env=env, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        peaks.append(int(done.stdout.split("PEAK")[1]))
+    print(
+        f"images {sizes[0] / 1e6:.0f} and {sizes[1] / 1e6:.0f} MB, peak {peaks[0] / 1e6:.0f} and {peaks[1] / 1e6:.0f} MB"
+    )
+    assert peaks[1] - peaks[0] < 0.25 * (sizes[1] - sizes[0])

@@ -1,0 +1,70 @@
+"""The benchmark's commands and its report, on small recorded runs with numbers one can check by hand."""
+
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import tyro
+
+from conftest import ROOT, SCRIPTS
+
+sys.path.append(str(ROOT / "benchmark"))
+import experiments
+import report
+
+RECORDED = Path(__file__).parent / "recorded"
+
+
+def test_tables_against_numbers_computed_by_hand(tmp_path: Path) -> None:
+    report.main(report.Args(runs=RECORDED, output=tmp_path))
+    text = (tmp_path / "report.md").read_text()
+    tables = {part.split(":")[0]: part.splitlines() for part in text.split("## ")[1:]}
+    row = next(line for line in tables["Table 1"] if line.startswith("| RSC3x2"))
+    # last three: 0.6, 0.5, 0.8: mean 0.6333, sample deviation 0.1528; interquartile mean weighs them 1/6, 4/6, 1/6
+    assert "| 0.63 ± 0.15 (3 seeds), IQM 0.62 [0.50, 0.80] | 0.82 ± 0.04 |" in row
+    assert "| 0.50 (1 seed) | 0.76 ± 0.02 |" in row
+    assert "| seed 1 unfinished (33%) | 0.04 ± 0.02 |" in row
+    assert next(line for line in tables["Table 1"] if line.startswith("| RC9")).count("missing") == 3
+    row = next(line for line in tables["Table 6"] if line.startswith("| RSC3x2"))
+    assert "| 0.41 ± 0.16 (3 seeds)" in row  # 1/3, 0.3, 0.6: mean 0.4111, deviation 0.1644
+    row = next(line for line in tables["Table 7"] if line.startswith("| RSC3x2"))
+    assert "| 0.80 ± 0.17 (3 seeds)" in row  # 0.9, 0.6, 0.9
+    row = next(line for line in tables["Table 8"] if line.startswith("| RSC3x2"))
+    assert "| 0.53 ± 0.06 (3 seeds)" in row  # 0.5, 0.5, 0.6
+    assert "| λ = 1 | 0.40 (1 seed) | 0.666 ± 0.072 |" in text and "| λ = 0.1 | 0.20 (1 seed) | 0.623 ± 0.081 |" in text
+    assert "| λ = 0.01 | missing | 0.446 ± 0.011 |" in text
+    assert "| MSE regression | seed 1 is a --quick trial | only a figure |" in text
+    for figure in ("figure_2.png", "figure_3.png", "figure_4.png", "figure_8.png"):
+        assert iio.imread(tmp_path / figure).std() > 10
+
+
+def test_interquartile_mean() -> None:
+    assert report.interquartile_mean([0.0, 1.0, 2.0, 100.0]) == 1.5
+    assert report.interquartile_mean([1.0, 2.0, 9.0]) == pytest.approx((0.25 * 1 + 1 * 2 + 0.25 * 9) / 1.5)
+
+
+def test_nothing_to_report(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as stop:
+        report.main(report.Args(runs=tmp_path, output=tmp_path / "out"))
+    assert stop.value.code == 2 and "--runs" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_every_command_of_the_matrix_is_one_the_scripts_accept() -> None:
+    printed = subprocess.run(
+        [sys.executable, str(ROOT / "benchmark" / "experiments.py"), "--dry-run"], capture_output=True, text=True
+    )
+    lines = printed.stdout.splitlines()
+    assert printed.returncode == 0 and len(lines) == 12 + (12 + 12) + (36 + 12) == len(set(lines))
+    modules = {f"{name}.py": __import__(name) for name in SCRIPTS}
+    made = set()
+    for line in lines:
+        python, script, *words = shlex.split(line)
+        args = tyro.cli(modules[script].Args, args=words)
+        name = f"runs/{args.env_id}__{args.exp_name}__{args.seed}"
+        if script == "ppo_aib.py":
+            assert str(args.belief or f"runs/{args.env_id}__aib_belief__{args.seed}/belief.pt") in made
+        made |= {name + "/belief.pt"} if script == "aib_belief.py" else {name}
+    assert len(experiments.commands(experiments.Args(ablations=False))[3]) == 36
