@@ -159,14 +159,16 @@ def variant_table(runs: dict, title: str, variants: dict[str, str], paper: dict[
 
 def draw(axes: plt.Axes, runs: list[Run] | None, column: str, label: str, colour: str | None) -> None:
     """One learning curve: mean over seeds at the steps all of them have, shaded by the standard deviation."""
+    runs = [run for run in runs or [] if not run.quick]
     if not runs:
         axes.plot([], [], color=colour, label=f"{label} (missing)")
         return
     length = min(len(run.columns["global_step"]) for run in runs)
     steps = runs[0].columns["global_step"][:length]
     values = np.stack([run.columns[column][:length] for run in runs])
+    seeds = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"
     unfinished = "" if all(run.finished for run in runs) else ", unfinished"
-    (line,) = axes.plot(steps, values.mean(0), color=colour, label=f"{label} ({len(runs)} seeds{unfinished})")
+    (line,) = axes.plot(steps, values.mean(0), color=colour, label=f"{label} ({seeds}{unfinished})")
     if len(runs) > 1:
         spread = values.std(0, ddof=1)
         axes.fill_between(steps, values.mean(0) - spread, values.mean(0) + spread, color=line.get_color(), alpha=0.2)
