@@ -1,11 +1,12 @@
 # make run: set everything up, then train AIB on InterceptFast (a --quick trial where there is no CUDA device)
 # make test: set everything up, then lint and run the tests
+# make bench: speed and memory, as ratios measured in one run
 # make bench-belief: train the belief and its ablations on RememberColor3 and print what each remembers
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .ONESHELL:
 .SILENT:
-.PHONY: run test bench-belief setup vulkan
+.PHONY: run test bench bench-belief setup vulkan
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -18,6 +19,10 @@ test: setup
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m pytest
+
+bench: setup
+	$(PY) -m pip install --quiet --no-deps colorama  # MIKASA-Robo's own PPO script wants it
+	$(PY) benchmark/speed.py
 
 bench-belief: setup
 	$(PY) benchmark/belief.py
