@@ -248,7 +248,7 @@ class HistoryEncoder(nn.Module):
         """
         rgb = batch["rgb"]
         with torch.autocast(rgb.device.type, torch.bfloat16, enabled=amp):
-            x = self.cnn((rgb.flatten(0, 1).float() - self.image_mean) / self.image_std)
+            x = self.cnn(rgb.flatten(0, 1).float().sub_(self.image_mean).div_(self.image_std))
         x = [x.float().view(*rgb.shape[:2], -1)]
         x += [batch["joints"]] if self.use_joints else []
         x += [batch["previous"]] if self.use_actions else []

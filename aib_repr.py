@@ -579,7 +579,7 @@ class ObservationEncoder(nn.Module):
 
     def forward(self, rgb: torch.Tensor, joints: torch.Tensor) -> Normal:
         with torch.autocast(rgb.device.type, torch.bfloat16, enabled=self.amp):
-            image = self.cnn(rgb.float() / 255)
+            image = self.cnn(rgb.float().div_(255))
         return self.net(torch.cat([image.float(), (joints - self.mean) / self.std], -1))
 
 

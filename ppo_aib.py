@@ -537,7 +537,7 @@ class HistoryEncoder(nn.Module):
         """
         rgb = batch["rgb"]
         with torch.autocast(rgb.device.type, torch.bfloat16, enabled=amp):
-            x = self.cnn((rgb.flatten(0, 1).float() - self.image_mean) / self.image_std)
+            x = self.cnn(rgb.flatten(0, 1).float().sub_(self.image_mean).div_(self.image_std))
         x = [x.float().view(*rgb.shape[:2], -1)]
         x += [batch["joints"]] if self.use_joints else []
         x += [batch["previous"]] if self.use_actions else []
@@ -614,7 +614,7 @@ class BeliefAgent(nn.Module):
         """Policy over actions (B, A) and value (B,) of rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u)."""
         belief = self.w_agg(self.w_enc(obs["particles"]).mean(-2))
         with torch.autocast(obs["rgb"].device.type, torch.bfloat16, enabled=self.amp):
-            image = self.cnn(obs["rgb"].float() / 255)
+            image = self.cnn(obs["rgb"].float().div_(255))
         x = torch.cat([image.float(), self.joints(obs["joints"]), belief], -1)
         mean = torch.tanh(self.actor(x))
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)

@@ -477,7 +477,7 @@ class Agent(nn.Module):
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of rgb (B, H, W, 3) uint8 and joints (B, J)."""
         with torch.autocast(obs["rgb"].device.type, torch.bfloat16, enabled=self.amp):
-            image = self.cnn(obs["rgb"].float() / 255)
+            image = self.cnn(obs["rgb"].float().div_(255))
         x = torch.cat([image.float(), self.joints(obs["joints"])], -1)
         mean = torch.tanh(self.actor(x))
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)

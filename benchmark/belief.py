@@ -52,10 +52,10 @@ class Args:
     """which rows of the table"""
     robot: str = "panda"
     """panda renders 3 times faster on a CPU than panda_wristcam"""
-    num_episodes: int = 200
+    num_episodes: int = 180
     """episodes of the random policy, a tenth of them held out"""
-    epochs: int = 30
-    """of stage 1"""
+    epochs: int = 24
+    """of stage 1, in updates of 100 transitions: u becomes compact after some 2,000 updates"""
     num_updates: int = 240
     """of stage 2"""
     batch_episodes: int = 16
@@ -113,6 +113,7 @@ def main(args: Args) -> None:
     base = ["--env-id", args.env_id, "--robot", args.robot]
     repr_dir = Path("runs") / f"{args.env_id}__bench_repr__1"
     sizes = ["--num-episodes", str(args.num_episodes), "--val-share", "0.1", "--epochs", str(args.epochs)]
+    sizes += ["--batch-size", "100", "--learning-rate", "1e-3"]
     took = {"stage 1": run([str(ROOT / "aib_repr.py"), *base, "--exp-name", "bench_repr", *sizes, "--num-envs", "20"])}
     updates = ["--repr-dir", str(repr_dir), "--num-updates", str(args.num_updates)]
     updates += ["--batch-episodes", str(args.batch_episodes), "--belief-lr", str(args.belief_lr)]
