@@ -1,5 +1,6 @@
 """Killed and stopped runs go on, and end where an uninterrupted run ends, to the last bit."""
 
+import json
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from conftest import ROOT, run
-from kill_table import KILLS, kill_and_go_on, make_reference, results
+from kill_table import KILLS, SIZES, kill_and_go_on, make_reference, results
 
 TASK = "RememberShapeAndColor3x2-v0"
 CHOSEN = ["env.step:27", "repr_losses:5", "os.replace:11", "belief_losses:4", "encode:2", "ppo_losses:11", "os.fsync:6"]
@@ -74,21 +75,30 @@ def test_a_killed_collection_goes_on_and_leaves_no_process(quick_runs: Path, tmp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_stop_signal_saves_and_leaves_with_code_0(quick_runs: Path, tmp_path: Path, number: signal.Signals) -> None:
+def test_a_stop_signal_saves_and_leaves_with_code_0(quick_runs: Path, tmp_path: Path) -> None:
     path = tmp_path / "runs" / f"{TASK}__ppo_baseline__1"
     process = start("ppo_baseline", tmp_path)
     wait_for(lambda: (path / "eval.csv").exists(), process)
     time.sleep(2)
     workers = children(process.pid)
-    os.kill(process.pid, number)
+    os.kill(process.pid, signal.SIGTERM)
     out, err = process.communicate(timeout=30)
     assert process.returncode == 0 and "run the same command again" in out and "Traceback" not in err, out + err
     assert not any(Path(f"/proc/{pid}").exists() for pid in workers)
-    if number == signal.SIGTERM:
-        code, out, err = run("ppo_baseline", "--env-id", TASK, "--quick", cwd=tmp_path)
-        assert code == 0 and "going on with" in out, out + err
-        assert results(path) == results(quick_runs / "runs" / f"{TASK}__ppo_baseline__1")
+    code, out, err = run("ppo_baseline", "--env-id", TASK, "--quick", cwd=tmp_path)
+    assert code == 0 and "going on with" in out, out + err
+    assert results(path) == results(quick_runs / "runs" / f"{TASK}__ppo_baseline__1")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGUSR1])
+def test_ctrl_c_and_sigusr1_do_the_same(tmp_path: Path, number: signal.Signals) -> None:
+    arguments = json.dumps({**SIZES["ppo_baseline"], "total_timesteps": 10**6})
+    command = [sys.executable, str(ROOT / "tests" / "toy_run.py"), "ppo_baseline", arguments]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: (tmp_path / "runs" / "ToyMemory-v0__ppo_baseline__1" / "checkpoint.pt").exists(), process)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 0 and "run the same command again" in out and "Traceback" not in err, out + err
 
 
 @pytest.mark.slow
