@@ -688,11 +688,12 @@ def train_belief(
     val: np.ndarray,
     path: Path,
     stop: StopSignal,
-    writer: SummaryWriter,
-) -> None:
+    events: Path,
+) -> SummaryWriter:
     """Train model = {belief, posterior, ...} on losses(model, batch, args), from the checkpoint in path if any.
 
     Leaves in model the weights with the best held-out -log p(u|z,h) under z ~ prior: what deployment needs.
+    Returns the TensorBoard writer of the folder events.
     """
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr)
     done, best_nll, best = 0, math.inf, copy.deepcopy(model.state_dict())
@@ -708,6 +709,7 @@ def train_belief(
         rng = np.random.default_rng([args.seed, update])
         return episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
 
+    writer = SummaryWriter(events, purge_step=done + 1)  # of an earlier process, rows up to the checkpoint stay
     bar = tqdm(total=args.num_updates, initial=done, desc="stage 2, belief", unit="update")
     start = saved = time.time()
     with ThreadPoolExecutor(1) as pool:  # reads the next batch while this one trains
@@ -740,12 +742,14 @@ def train_belief(
             if stop.received or time.time() - saved > 60 * args.checkpoint_minutes:
                 check_finite({n: x.sum() for n, x in model.named_parameters()}, f"update {update} of stage 2")
                 checkpoint = {"model": model.state_dict(), "optimizer": optimizer.state_dict(), "best": best}
+                writer.flush()
                 save(file, {"kind": kind, "update": update, "best_nll": best_nll, **checkpoint})
                 saved = time.time()
             if stop.received:
                 stop.leave(path)
     bar.close()
     model.load_state_dict(best)
+    return writer
 
 
 def main(args: Args) -> None:
@@ -777,8 +781,7 @@ def main(args: Args) -> None:
         if args.image_norm == "mean":
             belief.history.image_mean, belief.history.image_std = image_statistics(episodes.data, train[:256])
         model.to(device)
-        writer = SummaryWriter(path)
-        train_belief(args, model, belief_losses, episodes, train, val, path, stop, writer)
+        writer = train_belief(args, model, belief_losses, episodes, train, val, path, stop, path)
 
         fit, test = (encode(belief, model["posterior"], episodes, index) for index in (train[:512], val))
         report, readout = diagnose_belief(fit, test, cue[train[:512]], cue[val])

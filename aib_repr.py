@@ -730,7 +730,7 @@ def main(args: Args) -> None:
             optimizer.load_state_dict(checkpoint["optimizer"])
             update = checkpoint["update"]
             print(f"going on with {path} at update {update}", flush=True)
-        writer = SummaryWriter(path, purge_step=update)
+        writer = SummaryWriter(path, purge_step=update + 1)  # of an earlier process, rows up to the checkpoint stay
         bar = tqdm(total=args.epochs * per_epoch, initial=update, desc="stage 1, phi", unit="update")
         saved, ready = time.time(), None
         with ThreadPoolExecutor(1) as pool:  # reads the next batch while this one trains
@@ -762,6 +762,7 @@ def main(args: Args) -> None:
                         writer.add_scalar(f"held_out/{name}", torch.stack([p[name] for p in parts]).mean(), update)
                 if stop.received or time.time() - saved > 60 * args.checkpoint_minutes:
                     check_finite({n: x.sum() for n, x in model.named_parameters()}, f"update {update} of stage 1")
+                    writer.flush()
                     checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
                     save(path / "checkpoint.pt", {"kind": "aib_repr checkpoint", **checkpoint})
                     saved = time.time()

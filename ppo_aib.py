@@ -813,7 +813,7 @@ def train_ppo(
         print(f"going on with {path} at step {first * per_iteration:,}", flush=True)
     if args.compile:
         agent.compile()
-    writer = SummaryWriter(path, purge_step=first * per_iteration)
+    writer = SummaryWriter(path, purge_step=first * per_iteration + 1)  # of an earlier process, older rows stay
     bar = tqdm(total=num_iterations * per_iteration, initial=first * per_iteration, desc="PPO", unit="step")
     saved = start = time.time()
 
@@ -857,6 +857,7 @@ def train_ppo(
             if last:
                 break
             if time.time() - saved > 60 * args.checkpoint_minutes:
+                writer.flush()
                 save(path / "checkpoint.pt", snapshot)
                 saved = time.time()
             seed_everything(args.seed, 3, iteration)
@@ -866,6 +867,7 @@ def train_ppo(
             rolled = time.time()
             losses = ppo_update(agent, optimizer, data, args, stop)
         except Stopped:
+            writer.flush()
             save(path / "checkpoint.pt", snapshot)
             bar.close()
             stop.leave(path)

@@ -1078,11 +1078,12 @@ def train_belief(
     val: np.ndarray,
     path: Path,
     stop: StopSignal,
-    writer: SummaryWriter,
-) -> None:
+    events: Path,
+) -> SummaryWriter:
     """Train model = {belief, posterior, ...} on losses(model, batch, args), from the checkpoint in path if any.
 
     Leaves in model the weights with the best held-out -log p(u|z,h) under z ~ prior: what deployment needs.
+    Returns the TensorBoard writer of the folder events.
     """
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr)
     done, best_nll, best = 0, math.inf, copy.deepcopy(model.state_dict())
@@ -1098,6 +1099,7 @@ def train_belief(
         rng = np.random.default_rng([args.seed, update])
         return episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
 
+    writer = SummaryWriter(events, purge_step=done + 1)  # of an earlier process, rows up to the checkpoint stay
     bar = tqdm(total=args.num_updates, initial=done, desc="stage 2, belief", unit="update")
     start = saved = time.time()
     with ThreadPoolExecutor(1) as pool:  # reads the next batch while this one trains
@@ -1130,12 +1132,14 @@ def train_belief(
             if stop.received or time.time() - saved > 60 * args.checkpoint_minutes:
                 check_finite({n: x.sum() for n, x in model.named_parameters()}, f"update {update} of stage 2")
                 checkpoint = {"model": model.state_dict(), "optimizer": optimizer.state_dict(), "best": best}
+                writer.flush()
                 save(file, {"kind": kind, "update": update, "best_nll": best_nll, **checkpoint})
                 saved = time.time()
             if stop.received:
                 stop.leave(path)
     bar.close()
     model.load_state_dict(best)
+    return writer
 
 
 def train_ppo(
@@ -1166,7 +1170,7 @@ def train_ppo(
         print(f"going on with {path} at step {first * per_iteration:,}", flush=True)
     if args.compile:
         agent.compile()
-    writer = SummaryWriter(path, purge_step=first * per_iteration)
+    writer = SummaryWriter(path, purge_step=first * per_iteration + 1)  # of an earlier process, older rows stay
     bar = tqdm(total=num_iterations * per_iteration, initial=first * per_iteration, desc="PPO", unit="step")
     saved = start = time.time()
 
@@ -1210,6 +1214,7 @@ def train_ppo(
             if last:
                 break
             if time.time() - saved > 60 * args.checkpoint_minutes:
+                writer.flush()
                 save(path / "checkpoint.pt", snapshot)
                 saved = time.time()
             seed_everything(args.seed, 3, iteration)
@@ -1219,6 +1224,7 @@ def train_ppo(
             rolled = time.time()
             losses = ppo_update(agent, optimizer, data, args, stop)
         except Stopped:
+            writer.flush()
             save(path / "checkpoint.pt", snapshot)
             bar.close()
             stop.leave(path)
@@ -1281,8 +1287,7 @@ def make_belief(args: Args, path: Path, stop: StopSignal) -> None:
     if args.image_norm == "mean":
         belief.history.image_mean, belief.history.image_std = image_statistics(episodes.data, train[:256])
     model = nn.ModuleDict({"belief": belief, "posterior": posterior}).to(device)
-    writer = SummaryWriter(path)
-    train_belief(args, model, believer_losses, episodes, train, val, path, stop, writer)
+    writer = train_belief(args, model, believer_losses, episodes, train, val, path, stop, path / "belief_events")
     fit, test = (encode(belief, posterior, episodes, index) for index in (train[:512], val))
     report, readout = diagnose_belief(fit, test, cue[train[:512]], cue[val])
     write_report(report, path, f"{args.env_id}, {args.exp_name}", writer, args.num_updates)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 ROOT = Path(__file__).parent.parent
 SIZES = {
@@ -81,6 +82,13 @@ def flatten(x: object) -> object:
     return x.numpy().tobytes() if isinstance(x, torch.Tensor) else x
 
 
+def curves(folder: Path) -> dict[str, list]:
+    """TensorBoard's curves as (step, value), without those that measure time; each step must be there once."""
+    events = EventAccumulator(str(folder)).Reload()
+    tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(("time/", "charts/", "diagnostics"))]
+    return {tag: [(row.step, row.value) for row in events.Scalars(tag)] for tag in tags}
+
+
 def readable(folder: Path) -> bool:
     """Whether every file of the folder that has its final name can be read."""
     for file in folder.rglob("*"):
@@ -116,7 +124,8 @@ def kill_and_go_on(script: str, moment: str, reference: Path, folder: Path) -> d
     whole = readable(folder / run)
     finished = start(script, folder) == 0
     same = finished and results(folder / run) == results(reference / run)
-    return {"killed": killed, "files whole": whole, "finished": finished, "bit-identical": same}
+    row = {"killed": killed, "files whole": whole, "finished": finished, "bit-identical": same}
+    return row | {"same curves": finished and curves(folder / run) == curves(reference / run)}
 
 
 def main() -> None:
@@ -125,7 +134,7 @@ def main() -> None:
         reference = Path(name) / "reference"
         reference.mkdir()
         make_reference(reference, {script for script, _, _ in KILLS})
-        print(f"{'while':32} {'killed at':22} killed  files whole  finished  bit-identical")
+        print(f"{'while':32} {'killed at':22} killed  files whole  finished  bit-identical  same curves")
         good = True
         for number, (script, doing, moment) in enumerate(KILLS):
             folder = Path(name) / str(number)

@@ -113,6 +113,11 @@ def replace_array(name: str, array: np.ndarray) -> Callable[[], object]:
     return lambda: np.save(DATA / f"{name}.npy", array)
 
 
+def other_camera(path: Path) -> None:
+    config = torch.load(path, weights_only=True)["config"]
+    change(path, config={**config, "image_shape": [8, 8, 3]})()
+
+
 def code_in(path: Path) -> Callable[[], object]:
     return lambda: torch.save({"format": 1, "kind": "aib_belief", "x": Payload()}, path)
 
@@ -164,6 +169,7 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
     "belief.pt is repr.pt": (ppo_aib, {**PPO, "belief": REPR_PT}, None, ["is a 'repr'", "not a 'aib_belief'"]),
     "belief.pt of Believer": (ppo_aib, PPO, change(BELIEF_PT, kind="believer_belief"), ["'believer_belief'"]),
     "belief.pt of another task": (ppo_aib, PPO, change(BELIEF_PT, env_id="X-v0"), ["--env-id X-v0"]),
+    "belief.pt of another camera": (ppo_aib, PPO, lambda: other_camera(BELIEF_PT), ["images [8, 8, 3]"]),
     "belief.pt of a trial": (ppo_aib, PPO, change(BELIEF_PT, quick=True), ["no basis for a real run"]),
     "named belief missing": (ppo_aib, {**PPO, "belief": Path("no.pt")}, None, ["no.pt does not exist"]),
     "code in belief.pt": (ppo_aib, PPO, code_in(BELIEF_PT), ["belief.pt is damaged"]),
