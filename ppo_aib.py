@@ -623,31 +623,32 @@ class BeliefAgent(nn.Module):
 # ---------------------------------------------------------------- rollout, losses, update
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def play_with_belief(
     envs: gym.vector.VectorEnv, agent: BeliefAgent, belief: nn.Module, args: "Args", seeds: np.ndarray, explore: bool
 ) -> Iterator[dict]:
     """Play one whole episode per seed, in rounds of envs.num_envs; yields each round's steps, t = 0 to T.
 
-    A step holds t, index (the episodes of the round), rgb, joints, particles, value and cue, then, but for the last,
+    A step holds t, index (a slice: the episodes), rgb, joints, particles, value and cue, then, but for the last,
     action, logprob, reward and success. All noise is drawn before the rounds: results do not depend on the workers.
     """
-    steps, device, count = envs.spec.max_episode_steps, torch.device(args.device), args.num_particles
+    steps, device, n = envs.spec.max_episode_steps, torch.device(args.device), args.num_particles
     noise = torch.randn(steps, len(seeds), *envs.single_action_space.shape, device=device) * explore
-    z_noise = torch.randn(steps + 1, len(seeds), count, belief.config["z_dim"], device=device)
-    u_noise = torch.randn(steps + 1, len(seeds), count, belief.config["u_dim"], device=device) * args.particle_noise
+    z_noise = torch.randn(steps + 1, len(seeds), n, belief.config["z_dim"], device=device)
+    u_noise = torch.randn(steps + 1, len(seeds), n, belief.config["u_dim"], device=device) * args.particle_noise
     low, high = (
         torch.as_tensor(x, device=device) for x in (envs.single_action_space.low, envs.single_action_space.high)
     )
     for first in range(0, len(seeds), envs.num_envs):
-        index = np.arange(first, min(first + envs.num_envs, len(seeds)))
+        index = slice(first, min(first + envs.num_envs, len(seeds)))
+        count = index.stop - index.start
         obs, info = envs.reset(seed=np.resize(seeds[index], envs.num_envs).tolist())  # the last may idle
-        gru_state, previous = None, torch.zeros(len(index), len(low), device=device)
+        gru_state, previous = None, torch.zeros(count, len(low), device=device)
         for t in range(steps + 1):
-            step = {name: torch.as_tensor(obs[name], device=device)[: len(index)] for name in ("rgb", "joints")}
+            step = {name: torch.as_tensor(obs[name], device=device)[:count] for name in ("rgb", "joints")}
             now = {"rgb": step["rgb"][None], "joints": step["joints"][None], "previous": previous[None]}
             h, gru_state = belief.history(now, gru_state)
-            step["cue"] = torch.as_tensor(info["cue"], device=device)[: len(index)]  # for evaluation only
+            step["cue"] = torch.as_tensor(info["cue"], device=device)[:count]  # for evaluation only
             step["particles"] = belief.particles(h[0], z_noise[t, index], u_noise[t, index])
             policy, step["value"] = agent(step)
             if t < steps:
@@ -655,10 +656,10 @@ def play_with_belief(
                 step["logprob"] = policy.log_prob(step["action"]).sum(-1)
                 previous = step["action"].clamp(low, high)
                 sent = torch.zeros(envs.num_envs, len(low), device=device)
-                sent[: len(index)] = previous
+                sent[:count] = previous
                 obs, reward, _, _, info = envs.step(sent if args.sim_backend == "physx_cuda" else sent.cpu().numpy())
                 for name, x in (("reward", reward), ("success", info["success"])):
-                    step[name] = torch.as_tensor(x, device=device, dtype=torch.float32)[: len(index)]
+                    step[name] = torch.as_tensor(x, device=device, dtype=torch.float32)[:count]
             yield {"t": t, "index": index, **step}
 
 
@@ -739,8 +740,8 @@ def evaluate(played: Iterator[dict], steps: int, num_episodes: int) -> tuple[dic
         t, index = step["t"], step["index"]
         if t < steps:
             success[t, index], reward[t, index] = step["success"].cpu(), step["reward"].cpu()
-            for i in index[index < 8]:
-                frame = step["rgb"][i - index[0]].cpu().numpy().repeat(2, 0).repeat(2, 1)
+            for i in range(index.start, min(index.stop, 8)):
+                frame = step["rgb"][i - index.start].cpu().numpy().repeat(2, 0).repeat(2, 1)
                 if t and success[t - 1, i]:
                     edge = np.ones(frame.shape[:2], bool)
                     edge[6:-6, 6:-6] = False
@@ -823,7 +824,7 @@ def train_ppo(
             if stop.received:
                 raise Stopped
             yield step
-            (bar if explore else look_bar).update(len(step["index"]) * (step["t"] < steps))
+            (bar if explore else look_bar).update(len(step["value"]) * (step["t"] < steps))
         look_bar.close()
 
     def log(values: dict[str, float], prefix: str, global_step: int) -> None:

@@ -486,11 +486,11 @@ class Agent(nn.Module):
 # ---------------------------------------------------------------- rollout, losses, update
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def play(envs: gym.vector.VectorEnv, agent: Agent, args: "Args", seeds: np.ndarray, explore: bool) -> Iterator[dict]:
     """Play one whole episode per seed, in rounds of envs.num_envs; yields each round's steps, t = 0 to T.
 
-    A step holds t, index (the episodes of the round), rgb, joints and value, then, but for the last, action, logprob,
+    A step holds t, index (a slice: the episodes), rgb, joints and value, then, but for the last, action, logprob,
     reward and success. All noise is drawn before the rounds: results do not depend on the workers.
     """
     steps, device = envs.spec.max_episode_steps, torch.device(args.device)
@@ -499,19 +499,20 @@ def play(envs: gym.vector.VectorEnv, agent: Agent, args: "Args", seeds: np.ndarr
         torch.as_tensor(x, device=device) for x in (envs.single_action_space.low, envs.single_action_space.high)
     )
     for first in range(0, len(seeds), envs.num_envs):
-        index = np.arange(first, min(first + envs.num_envs, len(seeds)))
+        index = slice(first, min(first + envs.num_envs, len(seeds)))
+        count = index.stop - index.start
         obs, info = envs.reset(seed=np.resize(seeds[index], envs.num_envs).tolist())  # the last may idle
         for t in range(steps + 1):
-            step = {name: torch.as_tensor(obs[name], device=device)[: len(index)] for name in ("rgb", "joints")}
+            step = {name: torch.as_tensor(obs[name], device=device)[:count] for name in ("rgb", "joints")}
             policy, step["value"] = agent(step)
             if t < steps:
                 step["action"] = policy.mean + policy.stddev * noise[t, index]
                 step["logprob"] = policy.log_prob(step["action"]).sum(-1)
                 sent = torch.zeros(envs.num_envs, len(low), device=device)
-                sent[: len(index)] = step["action"].clamp(low, high)
+                sent[:count] = step["action"].clamp(low, high)
                 obs, reward, _, _, info = envs.step(sent if args.sim_backend == "physx_cuda" else sent.cpu().numpy())
                 for name, x in (("reward", reward), ("success", info["success"])):
-                    step[name] = torch.as_tensor(x, device=device, dtype=torch.float32)[: len(index)]
+                    step[name] = torch.as_tensor(x, device=device, dtype=torch.float32)[:count]
             yield {"t": t, "index": index, **step}
 
 
@@ -592,8 +593,8 @@ def evaluate(played: Iterator[dict], steps: int, num_episodes: int) -> tuple[dic
         t, index = step["t"], step["index"]
         if t < steps:
             success[t, index], reward[t, index] = step["success"].cpu(), step["reward"].cpu()
-            for i in index[index < 8]:
-                frame = step["rgb"][i - index[0]].cpu().numpy().repeat(2, 0).repeat(2, 1)
+            for i in range(index.start, min(index.stop, 8)):
+                frame = step["rgb"][i - index.start].cpu().numpy().repeat(2, 0).repeat(2, 1)
                 if t and success[t - 1, i]:
                     edge = np.ones(frame.shape[:2], bool)
                     edge[6:-6, 6:-6] = False
@@ -657,7 +658,7 @@ def train_ppo(
             if stop.received:
                 raise Stopped
             yield step
-            (bar if explore else look_bar).update(len(step["index"]) * (step["t"] < steps))
+            (bar if explore else look_bar).update(len(step["value"]) * (step["t"] < steps))
         look_bar.close()
 
     def log(values: dict[str, float], prefix: str, global_step: int) -> None:
