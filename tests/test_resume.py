@@ -40,6 +40,16 @@ def children(pid: int) -> list[int]:
     return [int(child) for child in found] + [grand for child in found for grand in children(int(child))]
 
 
+def all_gone(processes: list[int], seconds: float = 20) -> bool:
+    """Whether the processes end within some seconds."""
+    end = time.time() + seconds
+    while any(Path(f"/proc/{pid}").exists() for pid in processes):
+        if time.time() > end:
+            return False
+        time.sleep(0.2)
+    return True
+
+
 def start(script: str, cwd: Path) -> subprocess.Popen:
     """Start a quick run on the real simulator."""
     command = [sys.executable, str(ROOT / f"{script}.py"), "--env-id", TASK, "--quick"]
@@ -65,10 +75,7 @@ def test_a_killed_collection_goes_on_and_leaves_no_process(quick_runs: Path, tmp
     assert len(workers) >= 2
     process.kill()
     process.communicate()
-    deadline = time.time() + 20
-    while any(Path(f"/proc/{pid}").exists() for pid in workers):
-        assert time.time() < deadline, "orphans"
-        time.sleep(0.2)
+    assert all_gone(workers)
     code, out, err = run("aib_repr", "--env-id", TASK, "--quick", cwd=tmp_path)
     assert code == 0, err
     assert results(data) == results(quick_runs / "runs" / f"{TASK}__aib_repr__1" / "dataset")
@@ -84,7 +91,7 @@ def test_a_stop_signal_saves_and_leaves_with_code_0(quick_runs: Path, tmp_path: 
     os.kill(process.pid, signal.SIGTERM)
     out, err = process.communicate(timeout=30)
     assert process.returncode == 0 and "run the same command again" in out and "Traceback" not in err, out + err
-    assert not any(Path(f"/proc/{pid}").exists() for pid in workers)
+    assert all_gone(workers)
     code, out, err = run("ppo_baseline", "--env-id", TASK, "--quick", cwd=tmp_path)
     assert code == 0 and "going on with" in out, out + err
     assert results(path) == results(quick_runs / "runs" / f"{TASK}__ppo_baseline__1")
@@ -111,4 +118,4 @@ def test_a_dead_worker_ends_the_run_with_its_exit_code(tmp_path: Path) -> None:
     os.kill(spawned[0], signal.SIGKILL)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 1 and "died with exit code [-9]" in err and "run the same command again" in err
-    assert not any(Path(f"/proc/{pid}").exists() for pid in spawned)
+    assert all_gone(spawned)
