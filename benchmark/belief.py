@@ -69,7 +69,7 @@ class Args:
 def run(command: list[str]) -> float:
     """Run a command with its progress showing; returns the seconds it took."""
     start = time.time()
-    code = subprocess.run([sys.executable, *command], cwd=None, env=None).returncode
+    code = subprocess.run([sys.executable, *command]).returncode
     if code:
         sys.exit(code)
     return time.time() - start
