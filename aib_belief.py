@@ -206,6 +206,15 @@ class NatureCNN(nn.Module):
         return self.out(self.conv(images.permute(0, 3, 1, 2)))
 
 
+def orthogonal_init(module: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
+    """Orthogonal weights of the given gain and zero biases in every linear and convolutional layer of module."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d):
+            nn.init.orthogonal_(layer.weight, gain)
+            nn.init.zeros_(layer.bias)
+    return module
+
+
 class StateEncoder(nn.Module):
     """phi: privileged state (..., D), standardised inside, -> Normal over u (..., u_dim) (paper 3.1)."""
 
@@ -231,7 +240,7 @@ class HistoryEncoder(nn.Module):
         self.register_buffer("image_std", torch.tensor(255.0))
         self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
         embedding = 512 + config["joints_dim"] + config["action_dim"]
-        self.cnn = NatureCNN(config["image_shape"], 512)
+        self.cnn = orthogonal_init(NatureCNN(config["image_shape"], 512))
         self.gru = nn.GRU(embedding, 256, config["gru_layers"])
         self.out = mlp([256 + embedding, 256, 256])
 

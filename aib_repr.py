@@ -93,6 +93,8 @@ class Args:
     """standardise rewards; without it the reward term of a random policy is next to nothing"""
     kl_reduction: Literal["sum", "mean"] = "sum"
     """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
+    image_norm: Literal["mean", "none"] = "mean"
+    """subtract the dataset's mean image and divide by what varies, or just divide by 255"""
     amp: bool | None = None
     """bfloat16 convolutions; None: on CUDA and on CPUs with bfloat16 instructions"""
 
@@ -516,6 +518,18 @@ def read_transitions(data: Path, index: np.ndarray) -> dict[str, torch.Tensor]:
     return batch
 
 
+def image_statistics(data: Path, episodes: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean image (H, W, 3) of the episodes and standard deviation () of what remains, both in units of 0..255."""
+    total, square, count = 0.0, 0.0, 0
+    for episode in episodes:
+        images = np.load(data / "rgb.npy", mmap_mode="r")[episode].astype(np.float32)
+        total = total + images.sum(0, dtype=np.float64)
+        square = square + np.square(images).sum(0, dtype=np.float64)
+        count += len(images)
+    mean = total / count
+    return torch.from_numpy(mean).float(), torch.tensor(math.sqrt((square / count - mean**2).mean())).float()
+
+
 # ---------------------------------------------------------------- networks
 
 
@@ -553,6 +567,15 @@ class NatureCNN(nn.Module):
         return self.out(self.conv(images.permute(0, 3, 1, 2)))
 
 
+def orthogonal_init(module: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
+    """Orthogonal weights of the given gain and zero biases in every linear and convolutional layer of module."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d):
+            nn.init.orthogonal_(layer.weight, gain)
+            nn.init.zeros_(layer.bias)
+    return module
+
+
 class StateEncoder(nn.Module):
     """phi: privileged state (..., D), standardised inside, -> Normal over u (..., u_dim) (paper 3.1)."""
 
@@ -574,12 +597,14 @@ class ObservationEncoder(nn.Module):
         self.amp = amp
         self.register_buffer("mean", torch.zeros(joints_dim))
         self.register_buffer("std", torch.ones(joints_dim))
-        self.cnn = NatureCNN(image_shape, 256)
+        self.register_buffer("image_mean", torch.zeros(image_shape))
+        self.register_buffer("image_std", torch.tensor(255.0))
+        self.cnn = orthogonal_init(NatureCNN(image_shape, 256))
         self.net = GaussianMLP(256 + joints_dim, [256, 256], u_dim, min_std=1e-5)
 
     def forward(self, rgb: torch.Tensor, joints: torch.Tensor) -> Normal:
         with torch.autocast(rgb.device.type, torch.bfloat16, enabled=self.amp):
-            image = self.cnn(rgb.float().div_(255))
+            image = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
         return self.net(torch.cat([image.float(), (joints - self.mean) / self.std], -1))
 
 
@@ -709,6 +734,8 @@ def main(args: Args) -> None:
         for encoder, values in ((phi, arrays["state"][train]), (psi, arrays["joints"][train])):
             encoder.mean.copy_(torch.from_numpy(values.mean((0, 1), dtype=np.float64)))
             encoder.std.copy_(torch.from_numpy(values.std((0, 1), dtype=np.float64).clip(1e-3)))
+        if args.image_norm == "mean":
+            psi.image_mean, psi.image_std = image_statistics(data, train[:256])
         model = nn.ModuleDict({"phi": phi, "psi": psi, "g": Predictor(args.u_dim, action_dim)}).to(device)
         optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate)
         rewards = arrays["rewards"][train].astype(np.float64)

@@ -508,6 +508,15 @@ class NatureCNN(nn.Module):
         return self.out(self.conv(images.permute(0, 3, 1, 2)))
 
 
+def orthogonal_init(module: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
+    """Orthogonal weights of the given gain and zero biases in every linear and convolutional layer of module."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d):
+            nn.init.orthogonal_(layer.weight, gain)
+            nn.init.zeros_(layer.bias)
+    return module
+
+
 class HistoryEncoder(nn.Module):
     """h_t of the history (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and the current embedding.
 
@@ -520,7 +529,7 @@ class HistoryEncoder(nn.Module):
         self.register_buffer("image_std", torch.tensor(255.0))
         self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
         embedding = 512 + config["joints_dim"] + config["action_dim"]
-        self.cnn = NatureCNN(config["image_shape"], 512)
+        self.cnn = orthogonal_init(NatureCNN(config["image_shape"], 512))
         self.gru = nn.GRU(embedding, 256, config["gru_layers"])
         self.out = mlp([256 + embedding, 256, 256])
 
@@ -583,15 +592,6 @@ def score_readout(readout: dict, x: torch.Tensor, y: torch.Tensor) -> float:
 
 
 # ---------------------------------------------------------------- agent
-
-
-def orthogonal_init(module: nn.Module, gain: float = math.sqrt(2)) -> nn.Module:
-    """Orthogonal weights of the given gain and zero biases in every linear and convolutional layer of module."""
-    for layer in module.modules():
-        if isinstance(layer, nn.Linear | nn.Conv2d):
-            nn.init.orthogonal_(layer.weight, gain)
-            nn.init.zeros_(layer.bias)
-    return module
 
 
 class BeliefAgent(nn.Module):

@@ -53,7 +53,13 @@ def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path
         return (policy.log_prob(batch["action"]).sum(-1) - batch["logprob"]).exp()
 
     assert torch.allclose(ratio(batch["particles"]), torch.ones(80), atol=1e-5)
-    fresh = batch["particles"] + torch.randn_like(batch["particles"])
+
+    stored = torch.load(args.belief, weights_only=True)
+    belief = ppo_aib.AIBBelief(stored["config"])
+    belief.load_state_dict(stored["weights"])
+    h, _ = belief.history(data)
+    fresh = belief.particles(h, torch.randn(10, 8, 30, 32), torch.randn(10, 8, 30, 16)).flatten(0, 1)
+    assert torch.allclose(fresh.mean(-2), batch["particles"].mean(-2), atol=1.0), "draws from the same belief"
     assert (ratio(fresh) - 1).abs().max() > 1e-4, "fresh draws would not do"
 
 
