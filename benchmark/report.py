@@ -178,6 +178,8 @@ def finish(figure: plt.Figure, axes: np.ndarray, column: str, path: Path) -> Non
     """Label the axes and save the figure."""
     for ax in axes:
         ax.set(xlabel="environment steps", ylabel=column, ylim=(-0.02, 1.02))
+        if not any(len(line.get_xdata()) for line in ax.lines):
+            ax.set_xticks([])  # no runs, no scale
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
     figure.savefig(path, dpi=110)

@@ -228,6 +228,22 @@ def test_image_statistics(tmp_path: object) -> None:
     assert abs(std.item() - (rgb[:2] - rgb[:2].mean((0, 1))).std()) < 1e-2
 
 
+def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:
+    psi, history = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4), aib_belief.HistoryEncoder(CONFIG)
+    rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.zeros(2, 7)
+    for encoder, encode in (
+        (psi, lambda x: psi(x, joints).mean),
+        (history, lambda x: history({"rgb": x[None]})[0]),
+    ):
+        plain = encode(rgb)
+        encoder.image_mean, encoder.image_std = torch.full(IMAGE, 50.0), torch.tensor(255.0)
+        assert not torch.allclose(encode(rgb), plain, atol=1e-4)
+        assert torch.allclose(encode(rgb + 50), plain, atol=1e-5)
+        weight = encoder.cnn.out[0].weight
+        gram = weight.T @ weight if len(weight) > weight.shape[1] else weight @ weight.T
+        assert torch.allclose(gram, 2 * torch.eye(len(gram)), atol=1e-4)
+
+
 def test_readouts() -> None:
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(400, 6, generator=generator)
