@@ -885,7 +885,7 @@ class BeliefAgent(nn.Module):
 # ---------------------------------------------------------------- rollout, losses, update
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def play_with_belief(
     envs: gym.vector.VectorEnv, agent: BeliefAgent, belief: nn.Module, args: "Args", seeds: np.ndarray, explore: bool
 ) -> Iterator[dict]:
@@ -901,28 +901,31 @@ def play_with_belief(
     low, high = (
         torch.as_tensor(x, device=device) for x in (envs.single_action_space.low, envs.single_action_space.high)
     )
-    for first in range(0, len(seeds), envs.num_envs):
-        index = slice(first, min(first + envs.num_envs, len(seeds)))
-        count = index.stop - index.start
-        obs, info = envs.reset(seed=np.resize(seeds[index], envs.num_envs).tolist())  # the last may idle
-        gru_state, previous = None, torch.zeros(count, len(low), device=device)
-        for t in range(steps + 1):
-            step = {name: torch.as_tensor(obs[name], device=device)[:count] for name in ("rgb", "joints")}
-            now = {"rgb": step["rgb"][None], "joints": step["joints"][None], "previous": previous[None]}
-            h, gru_state = belief.history(now, gru_state)
-            step["cue"] = torch.as_tensor(info["cue"], device=device)[:count]  # for evaluation only
-            step["particles"] = belief.particles(h[0], z_noise[t, index], u_noise[t, index])
-            policy, step["value"] = agent(step)
-            if t < steps:
-                step["action"] = policy.mean + policy.stddev * noise[t, index]
-                step["logprob"] = policy.log_prob(step["action"]).sum(-1)
-                previous = step["action"].clamp(low, high)
-                sent = torch.zeros(envs.num_envs, len(low), device=device)
-                sent[:count] = previous
-                obs, reward, _, _, info = envs.step(sent if args.sim_backend == "physx_cuda" else sent.cpu().numpy())
-                for name, x in (("reward", reward), ("success", info["success"])):
-                    step[name] = torch.as_tensor(x, device=device, dtype=torch.float32)[:count]
-            yield {"t": t, "index": index, **step}
+    with torch.autocast(device.type, enabled=False):  # around all steps, so that weights are cast to bfloat16 once
+        for first in range(0, len(seeds), envs.num_envs):
+            index = slice(first, min(first + envs.num_envs, len(seeds)))
+            count = index.stop - index.start
+            obs, info = envs.reset(seed=np.resize(seeds[index], envs.num_envs).tolist())  # the last may idle
+            gru_state, previous = None, torch.zeros(count, len(low), device=device)
+            for t in range(steps + 1):
+                step = {name: torch.as_tensor(obs[name], device=device)[:count] for name in ("rgb", "joints")}
+                now = {"rgb": step["rgb"][None], "joints": step["joints"][None], "previous": previous[None]}
+                h, gru_state = belief.history(now, gru_state)
+                step["cue"] = torch.as_tensor(info["cue"], device=device)[:count]  # for evaluation only
+                step["particles"] = belief.particles(h[0], z_noise[t, index], u_noise[t, index])
+                policy, step["value"] = agent(step)
+                if t < steps:
+                    step["action"] = policy.mean + policy.stddev * noise[t, index]
+                    step["logprob"] = policy.log_prob(step["action"]).sum(-1)
+                    previous = step["action"].clamp(low, high)
+                    sent = torch.zeros(envs.num_envs, len(low), device=device)
+                    sent[:count] = previous
+                    obs, reward, _, _, info = envs.step(
+                        sent if args.sim_backend == "physx_cuda" else sent.cpu().numpy()
+                    )
+                    for name, x in (("reward", reward), ("success", info["success"])):
+                        step[name] = torch.as_tensor(x, device=device, dtype=torch.float32)[:count]
+                yield {"t": t, "index": index, **step}
 
 
 def gather(played: Iterator[dict], steps: int, num_episodes: int) -> dict[str, torch.Tensor]:
