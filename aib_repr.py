@@ -733,7 +733,8 @@ def main(args: Args) -> None:
         psi = ObservationEncoder(arrays["rgb"].shape[2:], arrays["joints"].shape[-1], args.u_dim, args.amp)
         for encoder, values in ((phi, arrays["state"][train]), (psi, arrays["joints"][train])):
             encoder.mean.copy_(torch.from_numpy(values.mean((0, 1), dtype=np.float64)))
-            encoder.std.copy_(torch.from_numpy(values.std((0, 1), dtype=np.float64).clip(1e-3)))
+            # the floor keeps a centimetre of jitter from counting as much as the whole table
+            encoder.std.copy_(torch.from_numpy(values.std((0, 1), dtype=np.float64).clip(0.05)))
         if args.image_norm == "mean":
             psi.image_mean, psi.image_std = image_statistics(data, train[:256])
         model = nn.ModuleDict({"phi": phi, "psi": psi, "g": Predictor(args.u_dim, action_dim)}).to(device)
