@@ -42,7 +42,7 @@ def main(args: Args) -> None:
         )
         env = ppo_baseline.make_task(settings, 1)
         obs, info = env.reset(seed=0)
-        sizes = [env.spec.max_episode_steps, "x".join(map(str, obs["rgb"].shape))]
+        sizes = [ppo_baseline.gym.spec(task).max_episode_steps, "x".join(map(str, obs["rgb"].shape))]
         sizes += [obs["joints"].size, info["state"].size, info["cue"].size]
         env.close()
         start = time.time()
