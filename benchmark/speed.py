@@ -7,6 +7,7 @@ Usage:   python benchmark/speed.py
          python benchmark/speed.py --env-id InterceptFast-v0 --episodes 16
 """
 
+import dataclasses
 import os
 import resource
 import statistics
@@ -157,6 +158,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
         for name, module, run in (
             ("plain PPO", ppo_baseline, play),
             ("AIB", ppo_aib, ppo_aib.build_aib(aib, envs, stored)[1]),
+            ("AIB, --amp", ppo_aib, ppo_aib.build_aib(dataclasses.replace(aib, amp=True), envs, stored)[1]),
         ):
             shares = []
             for _ in range(args.repeats):
