@@ -287,15 +287,16 @@ class AIBBelief(nn.Module):
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
 
-    def particles(self, h: torch.Tensor, z_noise: torch.Tensor, u_noise: torch.Tensor | None) -> torch.Tensor:
-        """Draw u_i ~ p(u|z_i,h), z_i ~ p(z|h) (paper 3.3): h (..., 256), noise (..., n, .) -> (..., n, u_dim).
-
-        Without u_noise each particle is its decoder's mean.
-        """
+    def decode(self, h: torch.Tensor, z_noise: torch.Tensor) -> Normal:
+        """Give p(u|z_i,h) of each z_i ~ p(z|h): h (..., 256), noise (..., n, z_dim) -> Normal over (..., n, u_dim)."""
         p = self.prior(h)
         z = p.mean.unsqueeze(-2) + p.stddev.unsqueeze(-2) * z_noise
-        decoded = self.decoder(torch.cat([z, h.unsqueeze(-2).expand(*z.shape[:-1], -1)], -1))
-        return decoded.mean if u_noise is None else decoded.mean + decoded.stddev * u_noise
+        return self.decoder(torch.cat([z, h.unsqueeze(-2).expand(*z.shape[:-1], -1)], -1))
+
+    def particles(self, h: torch.Tensor, z_noise: torch.Tensor, u_noise: torch.Tensor) -> torch.Tensor:
+        """Draw u_i ~ p(u|z_i,h), z_i ~ p(z|h) (paper 3.3): h (..., 256), noise (..., n, .) -> (..., n, u_dim)."""
+        decoded = self.decode(h, z_noise)
+        return decoded.mean + decoded.stddev * u_noise
 
 
 # ---------------------------------------------------------------- losses
@@ -389,7 +390,9 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
     """What the belief makes of episodes index (E,), on the device, each (E, T+1, .): h, u, and
 
     particle: the mean of 30 decoded prior samples; q: the posterior's mean; posterior: its decoding;
-    nll_prior, nll_posterior: -log p(u|z,h) (E, T+1) under one z of the prior and of the posterior; action (E, T, A).
+    nll_prior: -log p(u|h) (E, T+1), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows
+    of three possible places is right about each, which a single sample would not show; nll_posterior: -log p(u|z,h)
+    under one z of the posterior; action (E, T, A).
     """
     seed_everything(0)  # the same noise at every look, so that looks compare
     parts = []
@@ -397,11 +400,11 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
         batch = episodes(chunk)
         u, (h, _) = batch["u"], belief.history(batch)
         nll, _, _, mean = elbo_terms(belief, posterior, u, h)
-        p = belief.prior(h)
-        z_noise = torch.randn(*h.shape[:-1], 30, p.mean.shape[-1], device=h.device)
-        decode = [belief.decoder(torch.cat([z, h], -1)) for z in (p.mean + p.stddev * z_noise[..., 0, :], mean)]
-        part = {"h": h, "u": u, "particle": belief.particles(h, z_noise, None).mean(-2), "q": mean}
-        part |= {"posterior": decode[1].mean, "nll_posterior": nll, "nll_prior": -decode[0].log_prob(u).sum(-1)}
+        decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
+        log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
+        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "q": mean, "nll_posterior": nll}
+        part["nll_prior"] = math.log(30) - log_p.logsumexp(-1)
+        part["posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
         parts.append({name: x.transpose(0, 1) for name, x in {**part, "action": batch["actions"]}.items()})
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
@@ -701,7 +704,7 @@ def train_belief(
 ) -> SummaryWriter:
     """Train model = {belief, posterior, ...} on losses(model, batch, args), from the checkpoint in path if any.
 
-    Leaves in model the weights with the best held-out -log p(u|z,h) under z ~ prior: what deployment needs.
+    Leaves in model the weights with the best held-out -log p(u|h), z drawn from the prior: what deployment needs.
     Returns the TensorBoard writer of the folder events.
     """
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr)

@@ -109,7 +109,7 @@ class Args:
     compile: bool = False
     """compile policy, advantages and update with torch.compile; pays on CUDA"""
     amp: bool = False
-    """bfloat16 convolutions in the policy"""
+    """bfloat16 convolutions in policy and belief"""
     track: bool = False
     """also log to Weights & Biases"""
     evaluate: bool = False
@@ -567,15 +567,16 @@ class AIBBelief(nn.Module):
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
 
-    def particles(self, h: torch.Tensor, z_noise: torch.Tensor, u_noise: torch.Tensor | None) -> torch.Tensor:
-        """Draw u_i ~ p(u|z_i,h), z_i ~ p(z|h) (paper 3.3): h (..., 256), noise (..., n, .) -> (..., n, u_dim).
-
-        Without u_noise each particle is its decoder's mean.
-        """
+    def decode(self, h: torch.Tensor, z_noise: torch.Tensor) -> Normal:
+        """Give p(u|z_i,h) of each z_i ~ p(z|h): h (..., 256), noise (..., n, z_dim) -> Normal over (..., n, u_dim)."""
         p = self.prior(h)
         z = p.mean.unsqueeze(-2) + p.stddev.unsqueeze(-2) * z_noise
-        decoded = self.decoder(torch.cat([z, h.unsqueeze(-2).expand(*z.shape[:-1], -1)], -1))
-        return decoded.mean if u_noise is None else decoded.mean + decoded.stddev * u_noise
+        return self.decoder(torch.cat([z, h.unsqueeze(-2).expand(*z.shape[:-1], -1)], -1))
+
+    def particles(self, h: torch.Tensor, z_noise: torch.Tensor, u_noise: torch.Tensor) -> torch.Tensor:
+        """Draw u_i ~ p(u|z_i,h), z_i ~ p(z|h) (paper 3.3): h (..., 256), noise (..., n, .) -> (..., n, u_dim)."""
+        decoded = self.decode(h, z_noise)
+        return decoded.mean + decoded.stddev * u_noise
 
 
 def score_readout(readout: dict, x: torch.Tensor, y: torch.Tensor) -> float:
@@ -648,7 +649,7 @@ def play_with_belief(
             for t in range(steps + 1):
                 step = {name: torch.as_tensor(obs[name], device=device)[:count] for name in ("rgb", "joints")}
                 now = {"rgb": step["rgb"][None], "joints": step["joints"][None], "previous": previous[None]}
-                h, gru_state = belief.history(now, gru_state)
+                h, gru_state = belief.history(now, gru_state, amp=args.amp)
                 step["cue"] = torch.as_tensor(info["cue"], device=device)[:count]  # for evaluation only
                 step["particles"] = belief.particles(h[0], z_noise[t, index], u_noise[t, index])
                 policy, step["value"] = agent(step)

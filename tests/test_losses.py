@@ -163,7 +163,6 @@ def test_believer_has_a_fixed_prior() -> None:
     z, u = torch.randn(B, 30, 5), torch.randn(B, 30, 4)
     d = belief.decoder(torch.cat([z, h[0, :, None].expand(-1, 30, -1)], -1))
     assert torch.allclose(belief.particles(h[0], z, u), d.mean + d.stddev * u, atol=1e-5)
-    assert torch.allclose(belief.particles(h[0], z, None), d.mean, atol=1e-5)
 
 
 def test_particles_are_draws_from_prior_and_decoder() -> None:
@@ -175,6 +174,24 @@ def test_particles_are_draws_from_prior_and_decoder() -> None:
         drawn = belief.particles(h, z_noise, u_noise)
         assert drawn.shape == (B, 30, 4)
         assert torch.allclose(drawn[:, i], d.mean + d.stddev * u_noise[:, i], atol=1e-5)
+
+
+def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
+    model, batch = belief_model(), belief_batch()
+    belief, posterior = model["belief"], model["posterior"]
+    seen = aib_belief.encode(belief, posterior, lambda index: batch, np.arange(B))
+    aib_belief.seed_everything(0)
+    with torch.no_grad():
+        h, _ = belief.history(batch)
+        aib_belief.elbo_terms(belief, posterior, batch["u"], h)  # draws its noise first
+        p, noise = belief.prior(h), torch.randn(T + 1, B, 30, 5)
+        density, means = torch.zeros(T + 1, B), torch.zeros(T + 1, B, 4)
+        for i in range(30):
+            d = belief.decoder(torch.cat([p.mean + p.stddev * noise[:, :, i], h], -1))
+            density += d.log_prob(batch["u"]).sum(-1).exp() / 30
+            means += d.mean / 30
+    assert torch.allclose(seen["nll_prior"], -density.log().T, atol=1e-4)
+    assert torch.allclose(seen["particle"], means.transpose(0, 1), atol=1e-5)
 
 
 @pytest.mark.parametrize("layers, joints, actions", [(1, 0, 0), (2, 7, A)])
