@@ -6,7 +6,7 @@ term hands that shape to the prior, which is what the robot has when it acts.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
          the published variant: --image-norm none --no-chrono-init --bptt-steps 16, on stage 1 with
-         --no-reward-norm --kl-reduction mean --image-norm none
+         --no-reward-norm --kl-coef 0.03 --kl-reduction mean --image-norm none
 Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where they are missing, runs aib_repr.py first
 Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, diagnostics.png
 """

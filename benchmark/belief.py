@@ -56,7 +56,7 @@ class Args:
     """episodes of the random policy, a tenth of them held out; with 180 the belief learns the episodes by heart"""
     epochs: int = 11
     """of stage 1, in updates of 100 transitions: u becomes compact after some 2,000 updates"""
-    num_updates: int = 280
+    num_updates: int = 250
     """of stage 2"""
     batch_episodes: int = 16
     """whole episodes per update of stage 2"""
