@@ -929,6 +929,8 @@ def build_aib(args: Args, envs: gym.vector.VectorEnv, stored: dict) -> tuple[Bel
     belief = AIBBelief(config).to(device)
     belief.load_state_dict(stored["weights"])
     belief.requires_grad_(False)  # only the aggregator in the agent goes on learning
+    if args.amp:
+        belief.history.cnn.bfloat16()  # once: autocast would cast frozen weights anew at every step
     seed_everything(args.seed)
     sizes = (space["joints"].shape[0], envs.single_action_space.shape[0], config["u_dim"])
     agent = BeliefAgent(config["image_shape"], *sizes, args.amp).to(device)

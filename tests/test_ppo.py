@@ -35,9 +35,9 @@ def arguments(module: ModuleType, toy_stages: Path, **changes: object) -> object
     return module.Args(**{**SMALL, **more, **changes})
 
 
-def played(toy_stages: Path, explore: bool = True) -> tuple:
+def played(toy_stages: Path, explore: bool = True, **changes: object) -> tuple:
     """An AIB agent and what it gathered in one iteration of the toy task."""
-    args = ppo_aib.resolve(arguments(ppo_aib, toy_stages), ppo_aib.PPO_DEFAULTS)
+    args = ppo_aib.resolve(arguments(ppo_aib, toy_stages, **changes), ppo_aib.PPO_DEFAULTS)
     stored = torch.load(args.belief, weights_only=True)
     envs = toy.make_envs(args, 8)
     agent, play, _ = ppo_aib.build_aib(args, envs, stored)
@@ -61,6 +61,13 @@ def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path
     fresh = belief.particles(h, torch.randn(10, 8, 30, 32), torch.randn(10, 8, 30, 16)).flatten(0, 1)
     assert torch.allclose(fresh.mean(-2), batch["particles"].mean(-2), atol=1.0), "draws from the same belief"
     assert (ratio(fresh) - 1).abs().max() > 1e-4, "fresh draws would not do"
+
+
+def test_amp_changes_the_belief_by_rounding_only(toy_stages: Path) -> None:
+    (_, _, exact), (_, _, rounded) = (played(toy_stages, amp=amp) for amp in (False, True))
+    first = [data["particles"][0] for data in (exact, rounded)]  # later steps see other images
+    assert first[1].dtype == torch.float32
+    assert not torch.equal(*first) and torch.allclose(*first, atol=0.05)
 
 
 def test_rollout_arrays(toy_stages: Path) -> None:
