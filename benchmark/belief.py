@@ -52,11 +52,11 @@ class Args:
     """which rows of the table"""
     robot: str = "panda"
     """panda renders 3 times faster on a CPU than panda_wristcam"""
-    num_episodes: int = 400
-    """episodes of the random policy, a tenth of them held out; with 180 the belief learns the episodes by heart"""
-    epochs: int = 11
+    num_episodes: int = 320
+    """episodes of the random policy, a tenth of them held out"""
+    epochs: int = 13
     """of stage 1, in updates of 100 transitions: u becomes compact after some 2,000 updates"""
-    num_updates: int = 250
+    num_updates: int = 240
     """of stage 2"""
     batch_episodes: int = 16
     """whole episodes per update of stage 2"""
