@@ -623,6 +623,13 @@ def seed_everything(seed: int, *counter: int) -> None:
     torch.manual_seed(int(np.random.SeedSequence([seed, *counter]).generate_state(1)[0]))
 
 
+def keep_freed_memory() -> None:
+    """Let glibc keep what is freed: given back, every large tensor costs a page fault per 4 kB, update after update."""
+    libc = ctypes.CDLL(None)
+    libc.mallopt(-4, 0)  # M_MMAP_MAX: large tensors from the heap too
+    libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: a heap that does not shrink
+
+
 def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]:
     """Turn loss terms into numbers; one that is not finite ends the run with exit code 1 and leaves the checkpoint."""
     numbers = torch.stack([x.detach() for x in terms.values()]).tolist()  # all at once: one wait for the GPU
@@ -707,7 +714,7 @@ def train_belief(
     Leaves in model the weights with the best held-out -log p(u|h), z drawn from the prior: what deployment needs.
     Returns the TensorBoard writer of the folder events.
     """
-    optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr)
+    optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     done, best_nll, best = 0, math.inf, copy.deepcopy(model.state_dict())
     file, kind = path / "belief_checkpoint.pt", "belief checkpoint"
     if file.exists():
@@ -766,6 +773,7 @@ def train_belief(
 
 def main(args: Args) -> None:
     """Train the belief on whole episodes, keep the weights best on held-out ones, report what it remembers."""
+    keep_freed_memory()
     args = resolve(args, QUICK if args.quick else DEFAULTS)
     args.repr_dir = str(args.repr_dir or Path("runs") / f"{args.env_id}__aib_repr__{args.seed}")
     args.amp = has_bfloat16(args.device) if args.amp is None else args.amp

@@ -9,6 +9,7 @@ Reads:   nothing
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/ (one .npy memory map per array), repr.pt, diagnostics.json
 """
 
+import ctypes
 import difflib
 import fcntl
 import io
@@ -233,6 +234,13 @@ class StopSignal:
 def seed_everything(seed: int, *counter: int) -> None:
     """Seed torch from the run's seed and a counter: updates depend on weights and number only, and resume exactly."""
     torch.manual_seed(int(np.random.SeedSequence([seed, *counter]).generate_state(1)[0]))
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep what is freed: given back, every large tensor costs a page fault per 4 kB, update after update."""
+    libc = ctypes.CDLL(None)
+    libc.mallopt(-4, 0)  # M_MMAP_MAX: large tensors from the heap too
+    libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: a heap that does not shrink
 
 
 def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]:
@@ -720,6 +728,7 @@ def diagnose_repr(
 
 def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
+    keep_freed_memory()
     args = resolve(args, QUICK if args.quick else DEFAULTS)
     args.amp = has_bfloat16(args.device) if args.amp is None else args.amp
     num_val = math.ceil(args.num_episodes * args.val_share)
@@ -745,7 +754,7 @@ def main(args: Args) -> None:
         if args.image_norm == "mean":
             psi.image_mean, psi.image_std = image_statistics(data, train[:256])
         model = nn.ModuleDict({"phi": phi, "psi": psi, "g": Predictor(args.u_dim, action_dim)}).to(device)
-        optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate)
+        optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
         rewards = arrays["rewards"][train].astype(np.float64)
         r_mean, r_std = (rewards.mean(), rewards.std() + 1e-8) if args.reward_norm else (0.0, 1.0)
         coefs = {"reward": args.reward_coef, "state": args.state_coef, "obs": args.obs_coef, "kl": args.kl_coef}

@@ -298,6 +298,13 @@ def seed_everything(seed: int, *counter: int) -> None:
     torch.manual_seed(int(np.random.SeedSequence([seed, *counter]).generate_state(1)[0]))
 
 
+def keep_freed_memory() -> None:
+    """Let glibc keep what is freed: given back, every large tensor costs a page fault per 4 kB, update after update."""
+    libc = ctypes.CDLL(None)
+    libc.mallopt(-4, 0)  # M_MMAP_MAX: large tensors from the heap too
+    libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: a heap that does not shrink
+
+
 def check_finite(terms: dict[str, torch.Tensor], where: str) -> dict[str, float]:
     """Turn loss terms into numbers; one that is not finite ends the run with exit code 1 and leaves the checkpoint."""
     numbers = torch.stack([x.detach() for x in terms.values()]).tolist()  # all at once: one wait for the GPU
@@ -1092,7 +1099,7 @@ def train_belief(
     Leaves in model the weights with the best held-out -log p(u|h), z drawn from the prior: what deployment needs.
     Returns the TensorBoard writer of the folder events.
     """
-    optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr)
+    optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     done, best_nll, best = 0, math.inf, copy.deepcopy(model.state_dict())
     file, kind = path / "belief_checkpoint.pt", "belief checkpoint"
     if file.exists():
@@ -1167,7 +1174,7 @@ def train_ppo(
     steps, kind, mend = envs.spec.max_episode_steps, "ppo checkpoint", "start anew with --overwrite"
     per_iteration = steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // per_iteration)
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     first, rows = 0, []
     if (path / "checkpoint.pt").exists():
         checkpoint = load(path / "checkpoint.pt", kind, mend)
@@ -1331,6 +1338,7 @@ def build_believer(args: Args, envs: gym.vector.VectorEnv, stored: dict) -> tupl
 def main(args: Args) -> None:
     """Train belief and agent, or with --evaluate only evaluate an agent, of the Believer baseline."""
     defaults = PPO_DEFAULTS | TASKS.get(args.env_id, {}) | BELIEF_DEFAULTS
+    keep_freed_memory()
     args = resolve(args, defaults | (PPO_QUICK | BELIEF_QUICK if args.quick else {}))
     args.repr_dir = str(args.repr_dir or Path("runs") / f"{args.env_id}__aib_repr__{args.seed}")
     args.belief_amp = has_bfloat16(args.device) if args.belief_amp is None else args.belief_amp

@@ -77,13 +77,14 @@ def run(command: list[str]) -> float:
 
 def speed(device: torch.device) -> str:
     """One line: stage 2's update against the per-step loop on the same model and batch, as ratios of medians."""
+    aib_belief.keep_freed_memory()
     episodes, steps = (256, 90) if device.type == "cuda" else (8, 60)
     config = {"image_shape": [128, 128, 3], "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
     model = nn.ModuleDict({"belief": aib_belief.AIBBelief(config)})
     model["posterior"] = aib_belief.GaussianMLP(16 + 256, [256, 256], 32, min_std=0.1)
     model["head"] = aib_belief.mlp([2 * 32 + 8 + 1, 256, 8])
     model.to(device)
-    optimizer = torch.optim.Adam(model.parameters(), lr=3e-4)
+    optimizer = torch.optim.Adam(model.parameters(), lr=3e-4, fused=True)
     batch = {"rgb": torch.randint(0, 256, (steps + 1, episodes, 128, 128, 3), dtype=torch.uint8, device=device)}
     batch |= {"u": torch.randn(steps + 1, episodes, 16, device=device)}
     batch |= {"actions": torch.rand(steps, episodes, 8, device=device) * 2 - 1}

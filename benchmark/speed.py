@@ -121,7 +121,7 @@ def ours(module: object, play: object, steps: int, count: int, seeds: np.ndarray
 
 def update(agent: torch.nn.Module, data: dict, args: object) -> float:
     """Seconds of one PPO update."""
-    optimizer = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5, fused=True)
     start = time.perf_counter()
     ppo_baseline.ppo_update(agent, optimizer, data, args, SimpleNamespace(received=False))
     return time.perf_counter() - start
