@@ -1248,6 +1248,7 @@ def train_ppo(
         log({"success_once": once, "return": data["reward"].sum(0).mean().item()}, "train", global_step)
         log({"rollout": rolled - began, "update": time.time() - rolled}, "time", global_step)
         log({"SPS": done / (time.time() - start), "learning_rate": args.learning_rate}, "charts", global_step)
+        del data  # a gigabyte of images: not two at a time
     bar.close()
     writer.close()
     summary = {"env_id": args.env_id, "exp_name": args.exp_name, "seed": args.seed, "episodes": args.num_eval_episodes}

@@ -1,6 +1,7 @@
 """Stage 3 and the baselines on the toy task: what an iteration is made of, and that it depends on nothing else."""
 
 import csv
+import weakref
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -83,6 +84,23 @@ def test_rollout_arrays(toy_stages: Path) -> None:
         "reward": ((10, 8), torch.float32),
         "success": ((10, 8), torch.float32),
     }
+
+
+def test_the_last_rollout_is_gone_when_the_next_begins(
+    toy_stages: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    gather, images = ppo_baseline.gather, []
+
+    def watched(*args: object) -> dict:
+        assert all(image() is None for image in images)
+        data = gather(*args)
+        images.append(weakref.ref(data["rgb"]))
+        return data
+
+    monkeypatch.setattr(ppo_baseline, "gather", watched)
+    ppo_baseline.main(arguments(ppo_baseline, toy_stages))
+    assert len(images) == 2
 
 
 def test_images_of_the_default_intercept_rollout_fit_in_1_2_gb() -> None:
