@@ -459,9 +459,9 @@ def plot_diagnostics(report: dict, title: str) -> bytes:
     matplotlib.use("Agg")
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
     names = {"cue_from_u": "u (ceiling)", "cue_from_h": "h", "cue_from_particle": "mean particle"}
-    for (name, label), style in zip(names.items(), ("k:", "C0-", "C1-"), strict=True):
+    for (name, label), style in zip(names.items(), ("k:", "C0-", "C1--"), strict=True):
         left.plot(report[name], style, label=label)
-    left.axhline(report["cue_chance"], color="grey", linestyle="--", label="chance")
+    left.axhline(report["cue_chance"], color="grey", linestyle="-.", label="chance")
     left.set(xlabel="step", ylabel="held-out accuracy, or R2", title="cue, linear read-out", ylim=(-0.05, 1.05))
     right.plot(report["u_r2_posterior"], "k:", label="posterior (sees u)")
     right.plot(report["u_r2_prior"], "C1-", label="prior (mean particle)")
