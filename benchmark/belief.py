@@ -55,7 +55,7 @@ class Args:
     num_episodes: int = 320
     """episodes of the random policy, a tenth of them held out"""
     epochs: int = 13
-    """of stage 1, in updates of 100 transitions: u becomes compact after some 2,000 updates"""
+    """of stage 1, in updates of 100 transitions: some 2,200 updates on 320 episodes of 60 steps"""
     num_updates: int = 240
     """of stage 2"""
     batch_episodes: int = 16
