@@ -105,7 +105,7 @@ class Args:
     """convolutions in bfloat16"""
 
 
-QUICK = dict(exp_name="aib_repr_quick", robot="panda", num_envs=16, num_episodes=16, val_share=0.25, epochs=2)
+QUICK = dict(exp_name="aib_repr_quick", robot="panda", num_envs=8, num_episodes=8, val_share=0.25, epochs=2)
 
 
 # ---------------------------------------------------------------- networks

@@ -125,7 +125,7 @@ TASKS = {  # Table 5, where it differs from the defaults above, which are Interc
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
-QUICK = dict(exp_name="ppo_aib_quick", robot="panda", total_timesteps=720, num_envs=4, num_eval_episodes=4)
+QUICK = dict(exp_name="ppo_aib_quick", robot="panda", total_timesteps=360, num_envs=2, num_eval_episodes=2)
 QUICK["belief"] = "runs/{env_id}__aib_belief_quick__{seed}/belief.pt"
 
 

@@ -1,4 +1,4 @@
-"""What the tests share: a command line, the toy task in place of the simulator, and one small real run of everything."""
+"""What the tests share: a command line, the toy task in the simulator's place, and one small real run of everything."""
 
 import os
 import subprocess

@@ -14,39 +14,35 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 ROOT = Path(__file__).parent.parent
+PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num_workers=3)
 SIZES = {
-    "aib_repr": dict(num_episodes=12, val_share=0.25, epochs=2, batch_size=30, num_workers=2, checkpoint_minutes=0.0),
-    "aib_belief": dict(num_updates=6, batch_episodes=4, held_out_every=2, checkpoint_minutes=0.0),
-    "ppo_aib": dict(total_timesteps=240, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
-    "ppo_baseline": dict(total_timesteps=240, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
-    "ppo_believer": dict(total_timesteps=160, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4),
+    "aib_repr": dict(num_episodes=12, val_share=0.25, epochs=3, batch_size=30, num_workers=2),
+    "aib_belief": dict(num_updates=6, batch_episodes=4, held_out_every=2),
+    "ppo_aib": dict(total_timesteps=240, **PPO),
+    "ppo_believer": dict(total_timesteps=160, num_updates=4, batch_episodes=4, held_out_every=2, **PPO),
+    "ppo_baseline": dict(total_timesteps=240, **PPO),
 }
-for name in ("ppo_aib", "ppo_baseline", "ppo_believer"):
-    SIZES[name] |= dict(num_workers=4, update_epochs=2, gamma=0.99, checkpoint_minutes=0.0)
-SIZES["ppo_believer"] |= dict(num_updates=4, batch_episodes=4, held_out_every=2)
-
 KILLS = [  # script, what it was doing, the moment
-    ("aib_repr", "laying out the dataset", "create_dataset:1"),
     ("aib_repr", "collecting, first round", "env.step:5"),
     ("aib_repr", "collecting, third round", "env.step:27"),
-    ("aib_repr", "writing meta.json", "os.fsync:4"),
+    ("aib_repr", "renaming meta.json", "os.replace:4"),
     ("aib_repr", "stage 1, first update", "repr_losses:1"),
-    ("aib_repr", "stage 1, in an epoch", "repr_losses:5"),
+    ("aib_repr", "stage 1, in the second epoch", "repr_losses:6"),
     ("aib_repr", "stage 1, held-out losses", "repr_losses:4"),
-    ("aib_repr", "writing a checkpoint", "os.replace:11"),
+    ("aib_repr", "renaming a checkpoint", "os.replace:9"),
     ("aib_repr", "stage 1, diagnostics", "diagnose_repr:1"),
     ("aib_belief", "stage 2, first update", "belief_losses:1"),
-    ("aib_belief", "stage 2, fourth update", "belief_losses:4"),
+    ("aib_belief", "stage 2, between checkpoints", "belief_losses:4"),
     ("aib_belief", "stage 2, held-out look", "encode:2"),
-    ("aib_belief", "flushing a checkpoint", "os.fsync:3"),
+    ("aib_belief", "writing a checkpoint", "torch.save:2"),
     ("aib_belief", "stage 2, diagnostics", "diagnose_belief:1"),
-    ("aib_belief", "renaming belief.pt", "os.replace:10"),
-    ("ppo_aib", "PPO, first evaluation", "env.step:4"),
+    ("aib_belief", "renaming belief.pt", "os.replace:7"),
     ("ppo_aib", "PPO, rollout", "env.step:45"),
     ("ppo_aib", "PPO, update", "ppo_losses:11"),
-    ("ppo_aib", "PPO, encoding a video", "encode_video:2"),
-    ("ppo_aib", "PPO, flushing a checkpoint", "os.fsync:6"),
-    ("ppo_aib", "PPO, renaming eval.csv", "os.replace:7"),
+    ("ppo_aib", "PPO, evaluation", "env.step:64"),
+    ("ppo_aib", "PPO, making a video", "make_video:2"),
+    ("ppo_aib", "PPO, writing agent.pt", "torch.save:3"),
+    ("ppo_aib", "PPO, renaming eval.csv", "os.replace:6"),
     ("ppo_believer", "Believer, its belief", "believer_losses:3"),
     ("ppo_believer", "Believer, PPO update", "ppo_losses:9"),
     ("ppo_baseline", "plain PPO, second rollout", "env.step:62"),
@@ -66,9 +62,9 @@ def results(folder: Path) -> dict[str, object]:
         name = str(file.relative_to(folder))
         if file.suffix == ".npy":
             found[name] = np.load(file).tobytes()
-        elif file.suffix == ".csv" or file.name in ("diagnostics.json", "summary.json", "meta.json"):
+        elif file.suffix == ".csv" or file.name in ("diagnostics.json", "meta.json"):
             found[name] = file.read_bytes()
-        elif file.suffix == ".pt" and "checkpoint" not in file.name:
+        elif file.suffix == ".pt":
             found[name] = flatten(torch.load(file, weights_only=True))
     return found
 
@@ -85,7 +81,7 @@ def flatten(x: object) -> object:
 def curves(folder: Path) -> dict[str, list]:
     """TensorBoard's curves as (step, value), without those that measure time; each step must be there once."""
     events = EventAccumulator(str(folder)).Reload()
-    tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(("time/", "charts/", "diagnostics"))]
+    tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(("time/", "charts/"))]
     return {tag: [(row.step, row.value) for row in events.Scalars(tag)] for tag in tags}
 
 
@@ -101,14 +97,6 @@ def readable(folder: Path) -> bool:
     return True
 
 
-def before(script: str, reference: Path, folder: Path) -> None:
-    """Give folder the finished earlier stages of the reference run that a script reads."""
-    needs = {"aib_belief": ["aib_repr"], "ppo_aib": ["aib_belief"], "ppo_believer": ["aib_repr"]}
-    (folder / "runs").mkdir()
-    for stage in needs.get(script, []):
-        (folder / "runs" / f"ToyMemory-v0__{stage}__1").symlink_to(reference / "runs" / f"ToyMemory-v0__{stage}__1")
-
-
 def make_reference(folder: Path, scripts: set[str]) -> None:
     """Run the scripts without interruption, the earlier stages first."""
     for script in SIZES:
@@ -118,7 +106,11 @@ def make_reference(folder: Path, scripts: set[str]) -> None:
 
 def kill_and_go_on(script: str, moment: str, reference: Path, folder: Path) -> dict[str, bool]:
     """Kill a script at a moment, look at its files, run it again, compare with the reference."""
-    before(script, reference, folder)
+    needs = {"aib_belief": "aib_repr", "ppo_aib": "aib_belief", "ppo_believer": "aib_repr"}
+    (folder / "runs").mkdir()
+    if script in needs:
+        stage = Path("runs") / f"ToyMemory-v0__{needs[script]}__1"
+        (folder / stage).symlink_to(reference / stage)
     killed = start(script, folder, moment) == -9
     run = Path("runs") / f"ToyMemory-v0__{script}__1"
     whole = readable(folder / run)
