@@ -519,7 +519,7 @@ def main(args: Args) -> None:
 
 def fail(message: str) -> NoReturn:
     """Say on stderr, in one sentence, what is wrong and what to do, and leave with exit code 2."""
-    print(f"error: {message}", file=sys.stderr)
+    tqdm.write(f"error: {message}", file=sys.stderr)  # on a line of its own, below any progress bar
     sys.exit(2)
 
 

@@ -149,8 +149,9 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
 
 
 @pytest.fixture
-def folder(toy_task: Path, toy_stages: Path) -> Path:
+def folder(toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with copies of the toy task's stages and of a plain PPO run."""
+    monkeypatch.setattr(fcntl, "flock", lambda *_: None)  # a lock ends with its process, and this one goes on
     shutil.copytree(toy_stages, toy_task / "runs")
     train(ppo_baseline, **PPO)
     return toy_task
@@ -177,8 +178,10 @@ def test_bad_files_and_arguments(folder: Path, capfd: pytest.CaptureFixture, nam
     assert not (folder / "executed").exists(), "no code of a file runs"
 
 
-def test_a_second_process_is_refused(folder: Path, capfd: pytest.CaptureFixture) -> None:
-    fcntl.flock(lock := os.open(AGENT.parent, os.O_RDONLY), fcntl.LOCK_EX)
+def test_a_second_process_is_refused(toy_task: Path, capfd: pytest.CaptureFixture) -> None:
+    AGENT.parent.mkdir(parents=True)
+    lock = os.open(AGENT.parent, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)
     with pytest.raises(SystemExit) as stop:
         train(ppo_baseline, **PPO)
     os.close(lock)

@@ -1,4 +1,4 @@
-"""A toy memory task in place of the simulator, for tests of learning: it stands in for make_envs and check_task only."""
+"""A toy memory task instead of the simulator, for tests of learning: it stands in for make_envs and check_task."""
 
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
