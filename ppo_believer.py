@@ -614,7 +614,9 @@ def train_belief(args: Args, path: Path) -> None:
     if args.chrono_init:
         chrono_init(history.gru, len(sample["actions"]))
     if args.image_norm == "mean":
-        history.image_mean, history.image_std = image_statistics(np.load(episodes.dataset / "rgb.npy", "r")[train])
+        history.image_mean, history.image_std = image_statistics(
+            np.load(episodes.dataset / "rgb.npy", "r")[: len(train)]
+        )
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first, best_nll, best = 0, math.inf, None

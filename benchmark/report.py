@@ -2,7 +2,7 @@
 
 Usage:   python benchmark/report.py                 (reads runs/, writes benchmark/report/)
          python benchmark/report.py --runs results --output report
-Reads:   {runs}/{env_id}__{exp_name}__{seed}/ of the PPO scripts: args.json, eval.csv, summary.json if finished
+Reads:   {runs}/{env_id}__{exp_name}__{seed}/ of the PPO scripts: args.json, eval.csv
 Writes:  {output}/report.md and PNG figures
 """
 
@@ -96,7 +96,8 @@ def read_runs(folder: Path) -> dict[tuple[str, str], list[Run]]:
         rows = list(csv.DictReader(file.open()))
         columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
         share = columns["global_step"][-1] / args["total_timesteps"]
-        finished = (file.parent / "summary.json").exists()
+        per_iteration = columns["global_step"][-1] / columns["iteration"][-1]
+        finished = columns["global_step"][-1] + per_iteration > args["total_timesteps"]
         runs[args["env_id"], args["exp_name"]].append(Run(args["seed"], finished, args["quick"], share, columns))
     return {key: sorted(found, key=lambda run: run.seed) for key, found in runs.items()}
 
