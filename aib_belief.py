@@ -35,11 +35,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
 import tyro
-from sklearn.linear_model import LogisticRegression, RidgeCV
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn import linear_model, pipeline, preprocessing
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -134,7 +131,7 @@ class GaussianMLP(nn.Module):
 
     def forward(self, x: torch.Tensor) -> Normal:
         mean, raw = self.net(x).chunk(2, -1)
-        return Normal(mean, F.softplus(raw) + self.min_std, validate_args=False)
+        return Normal(mean, nn.functional.softplus(raw) + self.min_std, validate_args=False)
 
 
 def orthogonal_init(module: nn.Module, gain: float = 2**0.5) -> nn.Module:
@@ -258,11 +255,6 @@ def flow_matching_loss(
     return (velocity - (action - noise)).square().sum(-1)
 
 
-def regression_loss(head: nn.Module, action: torch.Tensor, z: torch.Tensor, z_next: torch.Tensor) -> torch.Tensor:
-    """The ablation's inverse dynamics at each step (...,): squared error of a_t from (z_t, z_t+1)."""
-    return (head(torch.cat([z, z_next], -1)) - action).square().sum(-1)
-
-
 def belief_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
     """L_Total = -L_VAE + lambda L_FM and its terms, averaged over all steps of a batch of whole episodes."""
     h, _ = model["belief"].history(batch, bptt_steps=args.bptt_steps)
@@ -275,7 +267,7 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Ar
             noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
             losses["action"] = flow_matching_loss(model["head"], action, z[:-1], z[1:], noise, tau).mean()
         else:
-            losses["action"] = regression_loss(model["head"], action, z[:-1], z[1:]).mean()
+            losses["action"] = (model["head"](torch.cat([z[:-1], z[1:]], -1)) - action).square().sum(-1).mean()
         losses["total"] = losses["total"] + args.action_lambda * losses["action"]
     return losses
 
@@ -305,7 +297,7 @@ class Episodes:
             batch["rgb"] = self.rgb[torch.from_numpy(index).to(self.device)]
         batch["u"] = self.u[index]
         batch = {name: x.to(self.device).transpose(0, 1) for name, x in batch.items()}
-        return {**batch, "previous": F.pad(batch["actions"], (0, 0, 0, 0, 1, 0)), "cue": self.cue[index]}
+        return {**batch, "previous": nn.functional.pad(batch["actions"], (0, 0, 0, 0, 1, 0)), "cue": self.cue[index]}
 
 
 def load_episodes(args: Args) -> tuple[Episodes, dict]:
@@ -344,10 +336,10 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
     """
     varies = y.amax(0) > y.amin(0)
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
-    if (y != y.round()).any() or len(np.unique(y)) > 32:
-        return make_pipeline(StandardScaler(), RidgeCV(np.logspace(-3, 4, 8))).fit(x, y).score(x_test, y_test)
-    classifier = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
-    return np.mean([classifier.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]).item()
+    classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
+    model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
+    model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
+    return float(np.mean([model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]))
 
 
 @torch.no_grad()
@@ -440,14 +432,9 @@ def main(args: Args) -> None:
     train, val = np.split(np.arange(len(episodes.u)), [-stored["num_val"]])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
-    config = {
-        "image_shape": list(sample["rgb"].shape[2:]),
-        "joints_dim": sample["joints"].shape[-1] if args.history_joints else 0,
-        "action_dim": action_dim if args.history_actions else 0,
-        "gru_layers": args.gru_layers,
-        "u_dim": stored["u_dim"],
-        "z_dim": args.z_dim,
-    }
+    config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers}
+    config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints, "u_dim": stored["u_dim"]}
+    config |= {"action_dim": action_dim * args.history_actions, "z_dim": args.z_dim}
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": AIBBelief(config, args.belief_amp)})
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
@@ -551,10 +538,8 @@ def open_run(args: Args) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        fail(f"another process is working in {path}; wait for it or choose another --exp-name")
     except OSError as error:
-        fail(f"{path} cannot be written ({error.strerror}); run from a folder where you may write")
+        fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     for file in path.iterdir() if args.overwrite else ():
         shutil.rmtree(file) if file.is_dir() else file.unlink()
     record, may_differ = path / "args.json", ("overwrite", "num_workers", "evaluate", "checkpoint")

@@ -28,16 +28,10 @@ import numpy as np
 import sapien
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
 import tyro
-from mani_skill.utils.assets import is_data_source_downloaded
-from mani_skill.utils.common import flatten_state_dict
-from mani_skill.utils.registration import REGISTERED_ENVS
-from mani_skill.utils.wrappers import CPUGymWrapper, FlattenRGBDObservationWrapper
+from mani_skill.utils import assets, common, registration, wrappers
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
-from sklearn.linear_model import LogisticRegression, RidgeCV
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn import linear_model, pipeline, preprocessing
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -127,7 +121,7 @@ class GaussianMLP(nn.Module):
 
     def forward(self, x: torch.Tensor) -> Normal:
         mean, raw = self.net(x).chunk(2, -1)
-        return Normal(mean, F.softplus(raw) + self.min_std, validate_args=False)
+        return Normal(mean, nn.functional.softplus(raw) + self.min_std, validate_args=False)
 
 
 def orthogonal_init(module: nn.Module, gain: float = 2**0.5) -> nn.Module:
@@ -296,10 +290,10 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
     """
     varies = y.amax(0) > y.amin(0)
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
-    if (y != y.round()).any() or len(np.unique(y)) > 32:
-        return make_pipeline(StandardScaler(), RidgeCV(np.logspace(-3, 4, 8))).fit(x, y).score(x_test, y_test)
-    classifier = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
-    return np.mean([classifier.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]).item()
+    classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
+    model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
+    model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
+    return float(np.mean([model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]))
 
 
 @torch.no_grad()
@@ -425,7 +419,7 @@ class TaskView(gym.Wrapper):
         facts = self.task._get_obs_extra(info)
         self.task._obs_mode = mode
         facts.pop("tcp_pose")  # it is among the joints
-        state = flatten_state_dict(facts, use_torch=True).float()
+        state = common.flatten_state_dict(facts, use_torch=True).float()
         state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
         cue = self.task.oracle_info.float().reshape(len(state), -1)
         for actor, pose in self.poses.items():
@@ -448,8 +442,8 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
     modes = dict(obs_mode="rgb", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
     backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
     env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
-    env = TaskView(FlattenRGBDObservationWrapper(env, rgb=True, depth=False, state=True))
-    return env if args.sim_backend == "physx_cuda" else CPUGymWrapper(env, ignore_terminations=True)
+    env = TaskView(wrappers.FlattenRGBDObservationWrapper(env, rgb=True, depth=False, state=True))
+    return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
 
 def make_envs(args: Args) -> gym.vector.VectorEnv:
@@ -471,12 +465,13 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
-    tasks = {uid: spec for uid, spec in REGISTERED_ENVS.items() if spec.cls.__module__.startswith("mikasa_robo_suite")}
+    specs = registration.REGISTERED_ENVS.items()
+    tasks = {name: spec for name, spec in specs if spec.cls.__module__.startswith("mikasa_robo_suite")}
     if args.env_id not in tasks:
-        near = difflib.get_close_matches(args.env_id, tasks, cutoff=0)
-        fail(f"unknown task --env-id {args.env_id}; the nearest names are {', '.join(near)}")
+        near = ", ".join(difflib.get_close_matches(args.env_id, tasks, cutoff=0))
+        fail(f"unknown task --env-id {args.env_id}; the nearest names are {near}")
     for asset in tasks[args.env_id].asset_download_ids or []:
-        if not is_data_source_downloaded(asset):
+        if not assets.is_data_source_downloaded(asset):
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")
     try:
         sapien.render.RenderSystem(sapien.Device(args.render_backend.removeprefix("sapien_")))
@@ -519,10 +514,8 @@ def open_run(args: Args) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        fail(f"another process is working in {path}; wait for it or choose another --exp-name")
     except OSError as error:
-        fail(f"{path} cannot be written ({error.strerror}); run from a folder where you may write")
+        fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     for file in path.iterdir() if args.overwrite else ():
         shutil.rmtree(file) if file.is_dir() else file.unlink()
     record, may_differ = path / "args.json", ("overwrite", "num_workers", "evaluate", "checkpoint")
