@@ -51,7 +51,7 @@ def test_no_rendering_device(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written() -> None:
     """Even root may not make a folder in /sys."""
-    refused(run("ppo_baseline", cwd=Path("/sys")), "cannot be written", "Permission denied")
+    refused(run("ppo_baseline", cwd=Path("/sys")), "cannot be written")
 
 
 @pytest.mark.parametrize(
