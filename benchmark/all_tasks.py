@@ -37,25 +37,15 @@ def main(args: Args) -> None:
     print("| task | steps | image | joints | state | cue | seconds | result |\n|" + "---|" * 8)
     failed = 0
     for task in args.tasks or tasks_without_download():
-        settings = ppo_baseline.resolve(
-            ppo_baseline.Args(env_id=task), ppo_baseline.PPO_DEFAULTS | ppo_baseline.PPO_QUICK
-        )
-        env = ppo_baseline.make_task(settings, 1)
+        env = ppo_baseline.make_task(ppo_baseline.Args(env_id=task, robot="panda"), 1)
         obs, info = env.reset(seed=0)
         sizes = [ppo_baseline.gym.spec(task).max_episode_steps, "x".join(map(str, obs["rgb"].shape))]
         sizes += [obs["joints"].size, info["state"].size, info["cue"].size]
         env.close()
         start = time.time()
-        command = [
-            sys.executable,
-            str(ROOT / "ppo_baseline.py"),
-            "--env-id",
-            task,
-            "--exp-name",
-            "all_tasks",
-            "--quick",
-        ]
-        command += ["--overwrite", "--total-timesteps", "1", "--num-envs", "2", "--num-eval-episodes", "2"]
+        sizes_of_run = "--total-timesteps 1 --num-envs 2 --num-eval-episodes 2".split()
+        command = [sys.executable, str(ROOT / "ppo_baseline.py"), "--env-id", task, "--exp-name", "all_tasks"]
+        command += ["--quick", "--overwrite", *sizes_of_run]
         done = subprocess.run(command, capture_output=True, text=True)
         result = "pass" if done.returncode == 0 else (done.stderr.strip().splitlines() or ["no message"])[-1]
         failed += done.returncode != 0

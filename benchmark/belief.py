@@ -14,7 +14,6 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 
 import torch
 import torch.nn as nn
@@ -36,11 +35,11 @@ ROWS = {
     "flow joints": ["--history-joints"],
 }
 BELIEVER = """
-import sys, tyro, ppo_believer as b
-args = b.resolve(tyro.cli(b.Args), b.PPO_DEFAULTS | b.BELIEF_DEFAULTS)
-args.belief_amp = b.has_bfloat16(args.device)
-with b.run_directory(args) as path:
-    (path / "belief.pt").exists() or b.make_belief(args, path, b.StopSignal())
+import ppo_believer as b
+args = b.parse_args({}, {})
+path = b.open_run(args)
+if not (path / "belief.pt").exists():
+    b.train_belief(args, path)
 """
 
 
@@ -77,7 +76,6 @@ def run(command: list[str]) -> float:
 
 def speed(device: torch.device) -> str:
     """One line: stage 2's update against the per-step loop on the same model and batch, as ratios of medians."""
-    aib_belief.keep_freed_memory()
     episodes, steps = (256, 90) if device.type == "cuda" else (8, 60)
     config = {"image_shape": [128, 128, 3], "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
     model = nn.ModuleDict({"belief": aib_belief.AIBBelief(config)})
@@ -93,11 +91,9 @@ def speed(device: torch.device) -> str:
     seconds = {name: [] for name in variants}
     for repeat in range(6):
         for name, (history, amp) in variants.items():
-            model["belief"].history = history
-            args = SimpleNamespace(bptt_steps=None, amp=amp, beta=1.0, action_head="flow", fm_latent="sample")
-            args.action_lambda = 1.0
+            model["belief"].history, whole.cnn.amp = history, amp
             start = time.time()
-            loss = aib_belief.belief_losses(model, batch, args)["total"]
+            loss = aib_belief.belief_losses(model, batch, aib_belief.Args())["total"]
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

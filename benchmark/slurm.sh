@@ -10,7 +10,7 @@
 #
 # Submit all of the paper's experiments with one line, from the repository's root:   bash benchmark/slurm.sh
 # Three job arrays follow one another: stage 1, the beliefs, PPO. A job that is preempted or runs into its time limit
-# saves, is queued again and goes on. Change the lines above to what your cluster wants.
+# is queued again and goes on from its last checkpoint. Change the lines above to what your cluster wants.
 set -euo pipefail
 
 if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
@@ -27,13 +27,6 @@ fi
 
 .venv/bin/python benchmark/experiments.py --phase "$PHASE" --index "$SLURM_ARRAY_TASK_ID" &
 child=$!
-stopped=
-# the script saves on SIGUSR1 and leaves with code 0; then the job goes back into the queue
-trap 'stopped=yes; pkill -USR1 -P "$child"' USR1
-code=0
-wait "$child" || code=$?
-if [ -n "$stopped" ]; then
-    wait "$child" || code=$?
-    scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"
-fi
-exit "$code"
+# an abrupt end loses nothing but the work since the last checkpoint
+trap 'scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"; pkill -P "$child"' USR1
+wait "$child"
