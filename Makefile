@@ -1,12 +1,13 @@
 # make run: set everything up, then train AIB on InterceptFast (a --quick trial where there is no CUDA device)
 # make test: set everything up, then lint and run the tests
+# make test-all: the same with every kill of every stage and three seeds of the learning test
 # make bench: speed and memory, as ratios measured in one run
 # make bench-belief: train the belief and its ablations on RememberColor3 and print what each remembers
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .ONESHELL:
 .SILENT:
-.PHONY: run test bench bench-belief setup vulkan
+.PHONY: run test test-all bench bench-belief setup vulkan
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -18,6 +19,9 @@ run: setup
 test: setup
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	$(PY) -m pytest -m "not thorough"
+
+test-all: setup
 	$(PY) -m pytest
 
 bench: setup
@@ -41,15 +45,20 @@ setup: .venv/installed vulkan
 vulkan: .venv/installed
 	renders() { $(PY) -c "import sapien; sapien.render.RenderSystem(sapien.Device('$$1'))" >/dev/null 2>&1; }
 	if renders cuda || renders cpu; then exit 0; fi
-	if [ "$$(id -u)" = 0 ]; then root=; elif sudo -n true 2>/dev/null; then root=sudo; else root=none; fi
-	if [ "$$root" = none ] || ! command -v apt-get >/dev/null; then
-	    echo "error: no Vulkan driver that SAPIEN can use; ask the administrator to install mesa-vulkan-drivers (24.3 or" \
-	        "newer; on Debian 12 from bookworm-backports) libvulkan1 and libx11-6, then run make again" >&2
+	if ! command -v apt-get >/dev/null; then
+	    echo "error: no Vulkan driver that SAPIEN can use; install Mesa's Vulkan drivers, 24.3 or newer, then run make again" >&2
+	    exit 2
+	fi
+	if [ "$$(id -u)" != 0 ]; then
+	    echo "error: no Vulkan driver that SAPIEN can use; install one with: sudo make vulkan (it adds your Debian's or" \
+	        "Ubuntu's mesa-vulkan-drivers, libvulkan1 and libx11-6, from backports where the release is too old)" >&2
 	    exit 2
 	fi
 	export DEBIAN_FRONTEND=noninteractive
 	. /etc/os-release
-	$$root apt-get update
+	echo "no Vulkan driver that SAPIEN can use: installing mesa-vulkan-drivers (24.3 or newer), libvulkan1 and libx11-6" \
+	    "with apt-get from $$PRETTY_NAME, or from its backports where those are too old"
+	apt-get update
 	candidate=$$(apt-cache policy mesa-vulkan-drivers | awk '/Candidate:/ { print $$2 }')
 	release=
 	if dpkg --compare-versions "$$candidate" lt 24.3; then
@@ -58,13 +67,13 @@ vulkan: .venv/installed
 	    if [ -e /etc/apt/sources.list.d/debian.sources ]; then
 	        awk -v suite="$$VERSION_CODENAME" -v new="$$release" 'BEGIN { RS = ""; ORS = "\n\n" }
 	            $$0 ~ "(^|\n)Suites:([^\n]*[ \t])?" suite "([ \t\n]|$$)" { sub(/Suites:[^\n]*/, "Suites: " new); print; exit }' \
-	            /etc/apt/sources.list.d/debian.sources | $$root tee /etc/apt/sources.list.d/$$release.sources
+	            /etc/apt/sources.list.d/debian.sources | tee /etc/apt/sources.list.d/$$release.sources
 	    else
 	        awk -v suite="$$VERSION_CODENAME" -v new="$$release" \
 	            '$$1 == "deb" { for (i = 2; i <= NF; i++) if ($$i == suite) { $$i = new; print; exit } }' \
-	            /etc/apt/sources.list | $$root tee /etc/apt/sources.list.d/$$release.list
+	            /etc/apt/sources.list | tee /etc/apt/sources.list.d/$$release.list
 	    fi
-	    $$root apt-get update
+	    apt-get update
 	fi
-	$$root apt-get install --yes --no-install-recommends $${release:+--target-release $$release} mesa-vulkan-drivers libvulkan1 libx11-6
+	apt-get install --yes --no-install-recommends $${release:+--target-release $$release} mesa-vulkan-drivers libvulkan1 libx11-6
 	renders cpu || { echo "error: the Vulkan driver is installed, and SAPIEN still cannot render; see README" >&2; exit 2; }

@@ -319,13 +319,6 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     return Episodes(path / "dataset", u, torch.from_numpy(arrays["cue"][:]), torch.device(args.device)), stored
 
 
-def image_statistics(rgb: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean image (H, W, 3) and standard deviation () of what remains, in units of 0..255: rgb (E, T, H, W, 3) uint8."""
-    frames = np.array(rgb[:128, ::8], np.float32)  # a sample that fits into memory
-    mean = frames.mean((0, 1))
-    return torch.from_numpy(mean), torch.tensor((frames - mean).std())
-
-
 # ---------------------------------------------------------------- evaluation
 
 
@@ -367,10 +360,7 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
 
 
 def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) -> dict:
-    """Report what the belief remembers, from encode's arrays of training (fit) and held-out (test) episodes.
-
-    Lists are per time step.
-    """
+    """What the belief remembers, lists by time step; fit and test: encode's of training and held-out episodes."""
     nll, nll_posterior = test["nll_prior"].mean().item(), test["nll_posterior"].mean().item()
     report = {"nll_prior": nll, "nll_posterior": nll_posterior, "prior_gap": nll - nll_posterior}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
@@ -445,9 +435,10 @@ def main(args: Args) -> None:
     if args.chrono_init:
         chrono_init(history.gru, len(sample["actions"]))
     if args.image_norm == "mean":
-        history.image_mean, history.image_std = image_statistics(
-            np.load(episodes.dataset / "rgb.npy", "r")[: len(train)]
-        )
+        rgb = np.load(episodes.dataset / "rgb.npy", mmap_mode="r")
+        frames = np.array(rgb[: len(train)][:128, ::8], np.float32)  # a sample that fits into memory
+        history.image_mean = torch.from_numpy(frames.mean((0, 1)))
+        history.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first, best_nll, best = 0, math.inf, None
@@ -484,16 +475,15 @@ def main(args: Args) -> None:
                 best_nll, best = nll, copy.deepcopy(model.state_dict())
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint, "best_nll": best_nll, "best": best})
+            checkpoint |= {"best_nll": best_nll, "best": best}
+            save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
     model.load_state_dict(best)
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (train[:512], val))
     report = diagnose_belief(fit, test)
-    known = {
-        "particle": fit["particle"][:, ::8].flatten(0, 1),
-        "cue": fit["cue"].repeat_interleave(len(fit["u"][0, ::8]), 0),
-    }
+    cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)
+    known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
     if args.action_head == "flow":
         report["flow_gain"] = flow_gain(model["head"], test["q"], test["action"])
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
@@ -586,10 +576,9 @@ def run_stage(script: str, args: Args) -> None:
     end_with_parent = partial(ctypes.CDLL(None).prctl, 1, signal.SIGTERM)
     child = subprocess.Popen(command, start_new_session=True, preexec_fn=end_with_parent)
     handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))
-    code = child.wait()
+    if child.wait():
+        sys.exit(child.returncode)
     signal.signal(signal.SIGINT, handler)
-    if code:
-        sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, diagnostics.json
 """
 
 import argparse
-import difflib
 import fcntl
 import json
 import math
@@ -93,8 +92,6 @@ class Args:
     """standardise rewards; without it the reward term of a random policy is next to nothing"""
     kl_reduction: Literal["sum", "mean"] = "sum"
     """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
-    image_norm: Literal["mean", "none"] = "mean"
-    """subtract the dataset's mean image and divide by what varies, or just divide by 255"""
     amp: bool = BFLOAT16
     """convolutions in bfloat16"""
 
@@ -184,14 +181,14 @@ class Predictor(nn.Module):
 
     def __init__(self, u_dim: int, action_dim: int):
         super().__init__()
-        self.body = nn.Sequential(mlp([2 * u_dim + action_dim, 256, 256, 256]), nn.ReLU())
-        self.reward, self.state, self.obs = nn.Linear(256, 1), nn.Linear(256, u_dim), nn.Linear(256, u_dim)
+        self.heads = [1, u_dim, u_dim]
+        self.net = mlp([2 * u_dim + action_dim, 256, 256, 256, sum(self.heads)])
         self.register_buffer("reward_mean", torch.zeros(()))
         self.register_buffer("reward_std", torch.ones(()))
 
     def forward(self, u_s: torch.Tensor, u_o: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        x = self.body(torch.cat([u_s, u_o, action], -1))
-        return self.reward(x).squeeze(-1), self.state(x), self.obs(x)
+        reward, next_u_s, next_u_o = self.net(torch.cat([u_s, u_o, action], -1)).split(self.heads, -1)
+        return reward.squeeze(-1), next_u_s, next_u_o
 
 
 # ---------------------------------------------------------------- losses
@@ -262,22 +259,13 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
 
 
 def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> dict[str, torch.Tensor]:
-    """Transitions (s, o, a, r, s', o') number index (B,), counted through all episodes (line 3), each (B, ...).
-
-    The maps are opened anew each time, so that pages once read do not stay in this process.
-    """
+    """Transitions (s, o, a, r, s', o') number index (B,), counted through all episodes (line 3), each (B, ...)."""
+    # opened anew each time, so that pages once read do not stay in this process
     arrays = {file.stem: np.load(file, mmap_mode="r") for file in dataset.glob("*.npy")}
     episode, t = np.divmod(index, arrays["actions"].shape[1])
     batch = {name: arrays[name][episode, t] for name in ("rgb", "joints", "state", "actions", "rewards")}
     batch |= {f"next_{name}": arrays[name][episode, t + 1] for name in ("rgb", "joints", "state")}
     return {name: torch.from_numpy(x).to(device) for name, x in batch.items()}
-
-
-def image_statistics(rgb: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean image (H, W, 3) and standard deviation () of what remains, in units of 0..255: rgb (E, T, H, W, 3) uint8."""
-    frames = np.array(rgb[:128, ::8], np.float32)  # a sample that fits into memory
-    mean = frames.mean((0, 1))
-    return torch.from_numpy(mean), torch.tensor((frames - mean).std())
 
 
 # ---------------------------------------------------------------- evaluation
@@ -298,15 +286,11 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
 
 @torch.no_grad()
 def diagnose_repr(phi: StateEncoder, state: torch.Tensor, cue: torch.Tensor, num_val: int) -> dict[str, float]:
-    """What u holds: active dimensions (std over 0.1) and read-out of the cue (N, K) in the last num_val of N episodes.
-
-    state (N, T+1, D). The read-out sees u with noise of std 0.1, the least that stage 2's decoder knows: what drowns in
-    it, no belief is asked to remember, however well it could be read from u itself.
-    """
+    """Active dimensions of u in the last num_val episodes, and read-out of their cue; state (N, T+1, D), cue (N, K)."""
     torch.manual_seed(0)
     u, cue = phi(state).mean, cue[:, None].expand(-1, state.shape[1], -1)
     active = (u[-num_val:].std((0, 1)) > 0.1).sum().item()
-    u = u + 0.1 * torch.randn_like(u)
+    u = u + 0.1 * torch.randn_like(u)  # stage 2's decoder cannot know it better than this
     rows = (x.flatten(0, 1) for x in (u[:-num_val], cue[:-num_val], u[-num_val:], cue[-num_val:]))
     return {"active_dimensions": active, "cue_readout": readout_score(*rows)}
 
@@ -337,14 +321,16 @@ def main(args: Args) -> None:
         encoder.mean.copy_(torch.from_numpy(x.mean((0, 1), dtype=np.float64)))
         # the floor keeps a centimetre of jitter from counting as much as the whole table
         encoder.std.copy_(torch.from_numpy(x.std((0, 1), dtype=np.float64).clip(0.05)))
-    if args.image_norm == "mean":
-        psi.image_mean, psi.image_std = image_statistics(train["rgb"])
+    frames = np.array(train["rgb"][:128, ::8], np.float32)  # a sample that fits into memory
+    psi.image_mean = torch.from_numpy(frames.mean((0, 1)))
+    psi.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
     if args.reward_norm:
         g.reward_mean.fill_(train["rewards"].mean(dtype=np.float64))
         g.reward_std.fill_(train["rewards"].std(dtype=np.float64) + 1e-8)
     model = nn.ModuleDict({"phi": phi, "psi": psi, "g": g}).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     transitions, held_out = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
+    held_out = held_out[:: math.ceil(len(held_out) / 1000)]  # what fits into one batch
     per_epoch, first = math.ceil(len(transitions) / args.batch_size), 0
     if (path / "checkpoint.pt").exists():
         checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
@@ -358,29 +344,25 @@ def main(args: Args) -> None:
     for epoch in range(first, args.epochs):
         torch.manual_seed(args.seed * 1_000_000 + epoch)  # so that a resumed run repeats the epoch
         order = np.random.default_rng([args.seed, epoch]).permutation(transitions)
-        for i, index in enumerate(np.array_split(order, per_epoch), 1):
+        for index in np.array_split(order, per_epoch):
             losses = repr_losses(model, read_transitions(dataset, index, device), args)
             optimizer.zero_grad()
             losses["total"].backward()
             nn.utils.clip_grad_norm_(model.parameters(), math.inf, error_if_nonfinite=True)  # only stops at NaN
             optimizer.step()
             bar.update()
-            if i % 20 == 0:
-                for name, value in losses.items():
-                    writer.add_scalar(f"losses/{name}", value, epoch * per_epoch + i)
 
         with torch.no_grad():
-            chunks = np.array_split(held_out, math.ceil(len(held_out) / args.batch_size))
-            parts = [repr_losses(model, read_transitions(dataset, index, device), args) for index in chunks]
-        for name in parts[0]:
-            writer.add_scalar(f"held_out/{name}", np.mean([part[name].item() for part in parts]), bar.n)
+            held_out_losses = repr_losses(model, read_transitions(dataset, held_out, device), args)
+        for name, loss in losses.items():
+            writer.add_scalar(f"losses/{name}", loss, bar.n)
+            writer.add_scalar(f"held_out/{name}", held_out_losses[name], bar.n)
         writer.flush()
         checkpoint = {"epoch": epoch + 1, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
         save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
-    state, cue = (torch.from_numpy(arrays[name][:]).to(device) for name in ("state", "cue"))
-    report = diagnose_repr(phi, state, cue, num_val)
+    report = diagnose_repr(phi.cpu(), torch.from_numpy(arrays["state"]), torch.from_numpy(arrays["cue"]), num_val)
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     content = {"kind": "repr", "env_id": args.env_id, "robot": args.robot, "num_val": num_val, "u_dim": args.u_dim}
     save(path / "repr.pt", {**content, "phi": phi.state_dict()})
@@ -465,11 +447,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
-    specs = registration.REGISTERED_ENVS.items()
-    tasks = {name: spec for name, spec in specs if spec.cls.__module__.startswith("mikasa_robo_suite")}
+    tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
-        near = ", ".join(difflib.get_close_matches(args.env_id, tasks, cutoff=0))
-        fail(f"unknown task --env-id {args.env_id}; the nearest names are {near}")
+        fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")
     for asset in tasks[args.env_id].asset_download_ids or []:
         if not assets.is_data_source_downloaded(asset):
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")

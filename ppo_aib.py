@@ -11,7 +11,6 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, Tensor
 
 import argparse
 import ctypes
-import difflib
 import fcntl
 import json
 import os
@@ -464,6 +463,7 @@ def main(args: Args) -> None:
             if losses["approx_kl"] > args.target_kl:
                 break
         scalars |= {f"losses/{name}": value.item() for name, value in losses.items()}
+        scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars |= {"charts/SPS": per_iteration / (time.time() - start), "charts/learning_rate": args.learning_rate}
         del data, batch, losses  # a gigabyte of images and a graph: not two at a time
 
@@ -483,9 +483,9 @@ def main(args: Args) -> None:
         for name, value in scalars.items():
             writer.add_scalar(name, value, global_step)
         writer.flush()
-        state = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "rows": rows}
-        progress = {"iteration": iteration, "finished": iteration == num_iterations}
-        save(path / "checkpoint.pt", {"kind": "checkpoint", **progress, **state})
+        checkpoint = {"iteration": iteration, "finished": iteration == num_iterations, "rows": rows}
+        checkpoint |= {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()}
+        save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
         bar.update(per_iteration)
     bar.close()
     for name in ("success_once", "success_at_end", "return"):
@@ -571,11 +571,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
-    specs = registration.REGISTERED_ENVS.items()
-    tasks = {name: spec for name, spec in specs if spec.cls.__module__.startswith("mikasa_robo_suite")}
+    tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
-        near = ", ".join(difflib.get_close_matches(args.env_id, tasks, cutoff=0))
-        fail(f"unknown task --env-id {args.env_id}; the nearest names are {near}")
+        fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")
     for asset in tasks[args.env_id].asset_download_ids or []:
         if not assets.is_data_source_downloaded(asset):
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")
@@ -668,10 +666,9 @@ def run_stage(script: str, args: Args) -> None:
     end_with_parent = partial(ctypes.CDLL(None).prctl, 1, signal.SIGTERM)
     child = subprocess.Popen(command, start_new_session=True, preexec_fn=end_with_parent)
     handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))
-    code = child.wait()
+    if child.wait():
+        sys.exit(child.returncode)
     signal.signal(signal.SIGINT, handler)
-    if code:
-        sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, diagno
 import argparse
 import copy
 import ctypes
-import difflib
 import fcntl
 import io
 import json
@@ -414,13 +413,6 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     return Episodes(path / "dataset", u, torch.from_numpy(arrays["cue"][:]), torch.device(args.device)), stored
 
 
-def image_statistics(rgb: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean image (H, W, 3) and standard deviation () of what remains, in units of 0..255: rgb (E, T, H, W, 3) uint8."""
-    frames = np.array(rgb[:128, ::8], np.float32)  # a sample that fits into memory
-    mean = frames.mean((0, 1))
-    return torch.from_numpy(mean), torch.tensor((frames - mean).std())
-
-
 @torch.no_grad()
 def rollout_with_belief(
     envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, seeds: np.ndarray, explore: bool = True
@@ -506,10 +498,7 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
 
 
 def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) -> dict:
-    """Report what the belief remembers, from encode's arrays of training (fit) and held-out (test) episodes.
-
-    Lists are per time step.
-    """
+    """What the belief remembers, lists by time step; fit and test: encode's of training and held-out episodes."""
     nll, nll_posterior = test["nll_prior"].mean().item(), test["nll_posterior"].mean().item()
     report = {"nll_prior": nll, "nll_posterior": nll_posterior, "prior_gap": nll - nll_posterior}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
@@ -599,9 +588,10 @@ def train_belief(args: Args, path: Path) -> None:
     if args.chrono_init:
         chrono_init(history.gru, len(sample["actions"]))
     if args.image_norm == "mean":
-        history.image_mean, history.image_std = image_statistics(
-            np.load(episodes.dataset / "rgb.npy", "r")[: len(train)]
-        )
+        rgb = np.load(episodes.dataset / "rgb.npy", mmap_mode="r")
+        frames = np.array(rgb[: len(train)][:128, ::8], np.float32)  # a sample that fits into memory
+        history.image_mean = torch.from_numpy(frames.mean((0, 1)))
+        history.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first, best_nll, best = 0, math.inf, None
@@ -638,18 +628,15 @@ def train_belief(args: Args, path: Path) -> None:
                 best_nll, best = nll, copy.deepcopy(model.state_dict())
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            save(
-                path / "belief_checkpoint.pt", {"kind": "checkpoint", **checkpoint, "best_nll": best_nll, "best": best}
-            )
+            checkpoint |= {"best_nll": best_nll, "best": best}
+            save(path / "belief_checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
     model.load_state_dict(best)
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (train[:512], val))
     report = diagnose_belief(fit, test)
-    known = {
-        "particle": fit["particle"][:, ::8].flatten(0, 1),
-        "cue": fit["cue"].repeat_interleave(len(fit["u"][0, ::8]), 0),
-    }
+    cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)
+    known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     save(path / "diagnostics.png", plot_diagnostics(report, f"{args.env_id}, {args.exp_name}"))
     content = {"kind": "believer_belief", "config": config, "known": known}
@@ -725,6 +712,7 @@ def main(args: Args) -> None:
             if losses["approx_kl"] > args.target_kl:
                 break
         scalars |= {f"losses/{name}": value.item() for name, value in losses.items()}
+        scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars |= {"charts/SPS": per_iteration / (time.time() - start), "charts/learning_rate": args.learning_rate}
         del data, batch, losses  # a gigabyte of images and a graph: not two at a time
 
@@ -744,9 +732,9 @@ def main(args: Args) -> None:
         for name, value in scalars.items():
             writer.add_scalar(name, value, global_step)
         writer.flush()
-        state = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "rows": rows}
-        progress = {"iteration": iteration, "finished": iteration == num_iterations}
-        save(path / "checkpoint.pt", {"kind": "checkpoint", **progress, **state})
+        checkpoint = {"iteration": iteration, "finished": iteration == num_iterations, "rows": rows}
+        checkpoint |= {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()}
+        save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
         bar.update(per_iteration)
     bar.close()
     for name in ("success_once", "success_at_end", "return"):
@@ -832,11 +820,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
-    specs = registration.REGISTERED_ENVS.items()
-    tasks = {name: spec for name, spec in specs if spec.cls.__module__.startswith("mikasa_robo_suite")}
+    tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
-        near = ", ".join(difflib.get_close_matches(args.env_id, tasks, cutoff=0))
-        fail(f"unknown task --env-id {args.env_id}; the nearest names are {near}")
+        fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")
     for asset in tasks[args.env_id].asset_download_ids or []:
         if not assets.is_data_source_downloaded(asset):
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")
@@ -929,10 +915,9 @@ def run_stage(script: str, args: Args) -> None:
     end_with_parent = partial(ctypes.CDLL(None).prctl, 1, signal.SIGTERM)
     child = subprocess.Popen(command, start_new_session=True, preexec_fn=end_with_parent)
     handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))
-    code = child.wait()
+    if child.wait():
+        sys.exit(child.returncode)
     signal.signal(signal.SIGINT, handler)
-    if code:
-        sys.exit(code)
 
 
 if __name__ == "__main__":

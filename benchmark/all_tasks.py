@@ -43,7 +43,7 @@ def main(args: Args) -> None:
         sizes += [obs["joints"].size, info["state"].size, info["cue"].size]
         env.close()
         start = time.time()
-        sizes_of_run = "--total-timesteps 1 --num-envs 2 --num-eval-episodes 2".split()
+        sizes_of_run = ["--total-timesteps", "1", "--num-envs", "2", "--num-eval-episodes", "2"]
         command = [sys.executable, str(ROOT / "ppo_baseline.py"), "--env-id", task, "--exp-name", "all_tasks"]
         command += ["--quick", "--overwrite", *sizes_of_run]
         done = subprocess.run(command, capture_output=True, text=True)

@@ -7,14 +7,14 @@ Usage:   python benchmark/speed.py
          python benchmark/speed.py --env-id InterceptFast-v0 --episodes 16
 """
 
-import dataclasses
 import os
 import resource
 import statistics
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal
@@ -49,17 +49,13 @@ class Clock:
     def __init__(self, envs: object):
         self.seconds = 0.0
         for name in ("reset", "step"):
-            setattr(envs, name, self._timed(getattr(envs, name)))
+            setattr(envs, name, partial(self._timed, getattr(envs, name)))
 
-    def _timed(self, function: object) -> object:
-        def timed(*args: object, **kwargs: object) -> object:
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                self.seconds += time.perf_counter() - start
-
-        return timed
+    def _timed(self, function: Callable, *args: object, **kwargs: object) -> object:
+        start = time.perf_counter()
+        result = function(*args, **kwargs)
+        self.seconds += time.perf_counter() - start
+        return result
 
 
 class MikasaAgent(torch.nn.Module):
@@ -73,9 +69,8 @@ class MikasaAgent(torch.nn.Module):
         """See ppo_baseline.Agent."""
         x = self.agent.get_features({"rgb": obs["rgb"], "state": obs["joints"]})
         mean = self.agent.actor_mean(x)
-        return torch.distributions.Normal(mean, self.agent.actor_logstd.exp().expand_as(mean)), self.agent.critic(x)[
-            :, 0
-        ]
+        policy = torch.distributions.Normal(mean, self.agent.actor_logstd.exp().expand_as(mean))
+        return policy, self.agent.critic(x)[:, 0]
 
 
 def mikasa(envs: object, seeds: np.ndarray) -> tuple[torch.nn.Module, dict, float]:
@@ -112,69 +107,76 @@ def mikasa(envs: object, seeds: np.ndarray) -> tuple[torch.nn.Module, dict, floa
     return MikasaAgent(agent), data, time.perf_counter() - start
 
 
-def ours(module: object, play: object, steps: int, count: int, seeds: np.ndarray) -> tuple[dict, float]:
-    """One rollout of a script; data, seconds."""
-    start = time.perf_counter()
-    data = module.gather(play(seeds, True), steps, count)
-    return data, time.perf_counter() - start
-
-
-def update(agent: torch.nn.Module, data: dict, args: object) -> float:
-    """Seconds of one PPO update."""
+def update(agent: torch.nn.Module, data: dict, args: ppo_baseline.Args) -> float:
+    """Seconds of one PPO update on a rollout, as in ppo_baseline.main."""
     optimizer = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5, fused=True)
-    start = time.perf_counter()
-    ppo_baseline.ppo_update(agent, optimizer, data, args, SimpleNamespace(received=False))
+    start, values = time.perf_counter(), data["value"]
+    advantage = ppo_baseline.compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
+    data = {**data, "advantage": advantage, "return": advantage + values[:-1]}
+    batch = {name: x.flatten(0, 1) for name, x in data.items() if name != "value"}
+    for _ in range(args.update_epochs):
+        for index in torch.randperm(advantage.numel()).tensor_split(args.num_minibatches):
+            losses = ppo_baseline.ppo_losses(agent, {name: x[index] for name, x in batch.items()}, args)
+            optimizer.zero_grad()
+            losses["total"].backward()
+            torch.nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            optimizer.step()
     return time.perf_counter() - start
+
+
+def timed(function: Callable, *arguments: object) -> tuple[object, float]:
+    """What a call returns, and its seconds."""
+    start = time.perf_counter()
+    return function(*arguments), time.perf_counter() - start
 
 
 def rows(args: Args) -> Iterator[tuple[str, str]]:
     """Measure, and give the table row by row."""
     yield "stage 2", belief.speed(torch.device("cpu"))
-    settings = ppo_baseline.Args(env_id=args.env_id, robot=args.robot, device="cpu", target_kl=1e9, num_minibatches=8)
-    settings = ppo_baseline.resolve(settings, ppo_baseline.PPO_DEFAULTS)
-    seeds = np.arange(args.episodes)
-    with ppo_baseline.simulator(settings, args.episodes) as envs:
-        steps, clock = envs.spec.max_episode_steps, Clock(envs)
-        agent, play, _ = ppo_baseline.build_ppo(settings, envs, {})
-        times = {name: [] for name in ("ours rollout", "mikasa rollout", "ours update", "mikasa update")}
-        for _ in range(args.repeats):
-            data, seconds = ours(ppo_baseline, play, steps, args.episodes, seeds)
-            times["ours rollout"].append(seconds)
-            times["ours update"].append(update(agent, data, settings))
-            their_agent, their_data, seconds = mikasa(envs, seeds)
-            times["mikasa rollout"].append(seconds)
-            times["mikasa update"].append(update(their_agent, their_data, settings))
-        median = {name: statistics.median(values) for name, values in times.items()}
-        for what in ("rollout", "update"):
-            ratio = median[f"mikasa {what}"] / median[f"ours {what}"]
-            yield f"plain PPO, {what}", f"{ratio:.2f} x as fast as with MIKASA-Robo's own agent and buffers"
-        bytes_ours, bytes_theirs = data["rgb"].nbytes, their_data["rgb"].nbytes
-        yield "plain PPO, image buffer", f"{bytes_ours / 1e6:.0f} MB against {bytes_theirs / 1e6:.0f} MB"
+    cores = len(os.sched_getaffinity(0))
+    settings = ppo_baseline.Args(env_id=args.env_id, robot=args.robot, num_minibatches=8, num_workers=cores)
+    seeds, envs = np.arange(args.episodes), ppo_baseline.make_envs(settings)
+    clock = Clock(envs)
+    image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
+    (action_dim,) = envs.single_action_space.shape
+    agent = ppo_baseline.Agent(image_shape, joints_dim, action_dim)
+    times = {name: [] for name in ("our rollout", "mikasa rollout", "our update", "mikasa update")}
+    for _ in range(args.repeats):
+        data, seconds = timed(ppo_baseline.rollout, envs, agent, settings, seeds)
+        times["our rollout"].append(seconds)
+        times["our update"].append(update(agent, data, settings))
+        their_agent, their_data, seconds = mikasa(envs, seeds)
+        times["mikasa rollout"].append(seconds)
+        times["mikasa update"].append(update(their_agent, their_data, settings))
+    median = {name: statistics.median(values) for name, values in times.items()}
+    for what in ("rollout", "update"):
+        ratio = median[f"mikasa {what}"] / median[f"our {what}"]
+        yield f"plain PPO, {what}", f"{ratio:.2f} x as fast as with MIKASA-Robo's own agent and buffers"
+    bytes_ours, bytes_theirs = data["rgb"].nbytes, their_data["rgb"].nbytes
+    yield "plain PPO, image buffer", f"{bytes_ours / 1e6:.0f} MB against {bytes_theirs / 1e6:.0f} MB"
 
-        config = {"image_shape": [128, 128, 3], "joints_dim": 0, "action_dim": 0, "gru_layers": 1}
-        config |= {"u_dim": 16, "z_dim": 32}
-        aib = ppo_aib.resolve(ppo_aib.Args(env_id=args.env_id, robot=args.robot, device="cpu"), ppo_aib.PPO_DEFAULTS)
-        stored = {"config": config, "weights": ppo_aib.AIBBelief(config).state_dict(), "readout": None}
-        for name, module, run in (
-            ("plain PPO", ppo_baseline, play),
-            ("AIB", ppo_aib, ppo_aib.build_aib(aib, envs, stored)[1]),
-            ("AIB, --amp", ppo_aib, ppo_aib.build_aib(dataclasses.replace(aib, amp=True), envs, stored)[1]),
-        ):
-            shares = []
-            for _ in range(args.repeats):
-                clock.seconds = 0.0
-                _, seconds = ours(module, run, steps, args.episodes, seeds)
-                shares.append(1 - clock.seconds / seconds)
-            yield f"{name}, rollout", f"{statistics.median(shares):.1%} of the time is not simulator"
+    config = {"image_shape": list(image_shape), "joints_dim": 0, "action_dim": 0, "gru_layers": 1}
+    config |= {"u_dim": 16, "z_dim": 32}
+    shares = {"plain PPO": (ppo_baseline.rollout, agent)}
+    for name, amp in (("AIB", False), ("AIB, --amp", True)):
+        believing = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(config, amp), joints_dim, action_dim, amp)
+        shares[name] = (ppo_aib.rollout_with_belief, believing)
+    for name, (play, player) in shares.items():
+        measured = []
+        for _ in range(args.repeats):
+            clock.seconds = 0.0
+            _, seconds = timed(play, envs, player, ppo_aib.Args(device="cpu"), seeds)
+            measured.append(1 - clock.seconds / seconds)
+        yield f"{name}, rollout", f"{statistics.median(measured):.1%} of the time is not simulator"
+    envs.close()
+
     rates = {}
-    for workers in range(1, len(os.sched_getaffinity(0)) + 1):
-        if args.episodes % workers == 0:
-            settings.num_workers = workers
-            with ppo_baseline.simulator(settings, args.episodes) as envs:
-                _, play, _ = ppo_baseline.build_ppo(settings, envs, {})
-                rates[workers] = 1 / min(ours(ppo_baseline, play, steps, args.episodes, seeds)[1] for _ in range(2))
-    scaling = ", ".join(f"{workers}: {rate / rates[1]:.2f} x" for workers, rate in rates.items())
-    yield "rollout with workers", scaling
+    for workers in range(1, cores + 1):
+        settings.num_workers = workers
+        envs = ppo_baseline.make_envs(settings)
+        rates[workers] = 1 / min(timed(ppo_baseline.rollout, envs, agent, settings, seeds)[1] for _ in range(2))
+        envs.close()
+    yield "rollout with workers", ", ".join(f"{workers}: {rate / rates[1]:.2f} x" for workers, rate in rates.items())
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     yield "peak memory of this process", f"{peak:.2f} GB"
 

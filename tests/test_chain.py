@@ -73,10 +73,10 @@ def test_a_finished_run_is_left_as_it_is(quick_runs: Path) -> None:
 
 def test_evaluate_alone_repeats_the_last_evaluation(quick_runs: Path) -> None:
     path = quick_runs / f"{TASK}__ppo_aib_quick__1"
-    options = ["--checkpoint", str(path / "agent.pt"), "--num-eval-episodes", "2", "--num-workers", "1"]
+    options = ["--checkpoint", str(path / "agent.pt"), "--num-eval-episodes", "2"]
     code, out, err = run("ppo_aib", "--evaluate", *options, cwd=quick_runs.parent)
     assert code == 0, err
     metrics = json.loads((path / "evaluation.json").read_text())
     last = list(csv.DictReader((path / "eval.csv").open()))[-1]
     for name in ("success_once", "success_at_end", "return"):
-        assert metrics[name] == pytest.approx(float(last[name]), abs=1e-6)
+        assert metrics[name] == pytest.approx(float(last[name]), rel=1e-4)

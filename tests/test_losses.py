@@ -1,6 +1,7 @@
 """Closed forms of every loss, the algorithm's lines, and where gradients go."""
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,7 @@ import aib_belief
 import aib_repr
 import ppo_aib
 import ppo_believer
+from conftest import TOY
 
 IMAGE = [36, 36, 3]
 CONFIG = {"image_shape": IMAGE, "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
@@ -242,12 +244,11 @@ def test_chrono_initialisation_sets_the_update_gate() -> None:
     assert kept.mean() > 0.85
 
 
-def test_image_statistics() -> None:
-    rgb = np.random.default_rng(0).integers(0, 256, (200, 17, 8, 8, 3), dtype=np.uint8)
-    mean, std = aib_belief.image_statistics(rgb)
-    sample = rgb[:128, [0, 8, 16]]
-    assert torch.allclose(mean, torch.from_numpy(sample.mean((0, 1))).float(), atol=1e-2)
-    assert abs(std.item() - (sample - sample.mean((0, 1))).std()) < 1e-2
+def test_the_belief_keeps_the_training_episodes_mean_image(toy_stages: Path) -> None:
+    rgb = np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "rgb.npy")[:19, ::8].astype(float)
+    history = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)["belief"]
+    assert torch.allclose(history["history.image_mean"].double(), torch.from_numpy(rgb.mean((0, 1))), atol=1e-3)
+    assert abs(history["history.image_std"].item() - (rgb - rgb.mean((0, 1))).std()) < 1e-3
 
 
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:

@@ -51,13 +51,19 @@ def wait_for(condition: Callable[[], bool], seconds: float = 180) -> None:
         time.sleep(0.1)
 
 
+def listen_to_ctrl_c() -> None:
+    """Let SIGINT mean what it means in a terminal."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def test_real_workers_end_with_their_parent_killed_or_stopped(quick_runs: Path, tmp_path: Path) -> None:
     """Kill a chain of stages outright, stop it by Ctrl-C, then let it go on to the same dataset."""
     meta = tmp_path / "runs" / f"{TASK}__aib_repr_quick__1" / "dataset" / "meta.json"
     command = [sys.executable, str(ROOT / "aib_belief.py"), "--env-id", TASK, "--quick"]
     for number, episodes in ((signal.SIGKILL, 2), (signal.SIGINT, 4)):
         pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
-        process = subprocess.Popen(command, cwd=tmp_path, **pipes)
+        # whoever runs the tests in the background has them ignore Ctrl-C, and children inherit that
+        process = subprocess.Popen(command, cwd=tmp_path, **pipes, preexec_fn=listen_to_ctrl_c)
         wait_for(lambda: meta.exists() and f'"episodes_done": {episodes}' in meta.read_text())  # noqa: B023
         family = children(process.pid)
         assert len(family) >= 3, "aib_repr.py and its two workers"
