@@ -64,8 +64,10 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """panda renders 3 times faster on a CPU"""
-    num_workers: int = len(os.sched_getaffinity(0))
+    """with or without a camera at its wrist, through which the policy does not see"""
+    mesh_triangles: int = 0 if CUDA else 500
+    """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
+    num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; any number gives the same results"""
     quick: bool = False
     """a trial of a few minutes whose results mean nothing"""
@@ -108,7 +110,7 @@ class Args:
     """updates between looks at the held-out episodes; the best weights are kept"""
 
 
-QUICK = dict(exp_name="aib_belief_quick", robot="panda", num_updates=4, batch_episodes=4)
+QUICK = dict(exp_name="aib_belief_quick", num_updates=4, batch_episodes=4)
 QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 
 
@@ -173,15 +175,13 @@ class StateEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the history o_0, a_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
-
-    Of the observations it always has the image; joints and actions where their sizes in config are not 0.
-    """
+    """h_t of the history o_0, a_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
+        # beside the image, joints and previous actions, where their sizes are not 0
         self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
         inputs = 512 + config["joints_dim"] + config["action_dim"]
         self.cnn = orthogonal_init(NatureCNN(config["image_shape"], 512, amp))
@@ -306,7 +306,8 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, QUICK["repr_dir"]):
         run_stage("aib_repr.py", args)
     hint = f"make it anew with aib_repr.py --env-id {args.env_id} --seed {args.seed} --overwrite"
-    stored = load(path / "repr.pt", hint, kind="repr", env_id=args.env_id, robot=args.robot)
+    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
+    stored = load(path / "repr.pt", hint, kind="repr", **task)
     try:
         names = ("rgb", "joints", "state", "actions", "cue")
         arrays = {name: np.load(path / "dataset" / f"{name}.npy", mmap_mode="r") for name in names}
@@ -315,18 +316,15 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     phi = StateEncoder(arrays["state"].shape[-1], stored["u_dim"])
     phi.load_state_dict(stored["phi"])
     with torch.no_grad():
-        u = phi(torch.from_numpy(arrays["state"][:])).mean
-    return Episodes(path / "dataset", u, torch.from_numpy(arrays["cue"][:]), torch.device(args.device)), stored
+        u = phi(torch.from_numpy(np.array(arrays["state"]))).mean
+    return Episodes(path / "dataset", u, torch.from_numpy(np.array(arrays["cue"])), torch.device(args.device)), stored
 
 
 # ---------------------------------------------------------------- evaluation
 
 
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """How well a linear map fitted on x (N, F), y (N, K) tells y_test from x_test, mean over the columns that vary.
-
-    Accuracy where y is few whole numbers (colours, shapes), else R2; the ridge is chosen by cross-validation.
-    """
+    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test."""
     varies = y.amax(0) > y.amin(0)
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
     classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
@@ -488,7 +486,7 @@ def main(args: Args) -> None:
         report["flow_gain"] = flow_gain(model["head"], test["q"], test["action"])
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     save(path / "diagnostics.png", plot_diagnostics(report, f"{args.env_id}, {args.exp_name}"))
-    content = {"kind": "aib_belief", "env_id": args.env_id, "robot": args.robot, "config": config, "known": known}
+    content = {"kind": "aib_belief", **asdict(args), "config": config, "known": known}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict(), "training": model.state_dict()})
     print(f"{path / 'diagnostics.png'} shows what the belief remembers")
 
@@ -511,7 +509,7 @@ def parse_args(tasks: dict[str, dict], quick: dict) -> Args:
     settings = tasks.get(chosen.env_id, {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
-        least = 0 if isinstance(value, bool | float) or name == "seed" else 1
+        least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
@@ -569,7 +567,7 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 def run_stage(script: str, args: Args) -> None:
     """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and --quick."""
     command = [sys.executable, str(Path(__file__).with_name(script))] + ["--quick"] * args.quick
-    for name in ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "num_workers"):
+    for name in ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
     # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it

@@ -11,22 +11,28 @@ import argparse
 import fcntl
 import json
 import math
+import multiprocessing
 import os
 import shutil
 import signal
 import sys
+import tempfile
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
 
+import fast_simplification
 import gymnasium as gym
 import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
 import numpy as np
 import sapien
 import torch
 import torch.nn as nn
+import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
@@ -58,8 +64,10 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """panda renders 3 times faster on a CPU"""
-    num_workers: int = len(os.sched_getaffinity(0))
+    """with or without a camera at its wrist, through which the policy does not see"""
+    mesh_triangles: int = 0 if CUDA else 500
+    """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
+    num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; any number gives the same results"""
     quick: bool = False
     """a trial of a few minutes whose results mean nothing"""
@@ -96,7 +104,7 @@ class Args:
     """convolutions in bfloat16"""
 
 
-QUICK = dict(exp_name="aib_repr_quick", robot="panda", num_envs=8, num_episodes=8, val_share=0.25, epochs=2)
+QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_share=0.25, epochs=2)
 
 
 # ---------------------------------------------------------------- networks
@@ -214,12 +222,11 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args
 
 
 def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
-    """Fill dataset/ with args.num_episodes whole episodes of the uniformly random policy, from where it stopped.
+    """Fill dataset/ from where it stopped with N whole episodes of the uniformly random policy; its memory maps:
 
-    Returns memory maps of N episodes of T steps: rgb (N, T+1, H, W, 3) uint8, joints, state (N, T+1, .), actions
-    (N, T, A), rewards, success (N, T), cue (N, K). Episodes have their own seeds: the number of workers is free.
+    rgb (N, T+1, H, W, 3) uint8; joints, state (N, T+1, .); actions (N, T, A); rewards, success (N, T); cue (N, K).
     """
-    meta = {"format": FORMAT, "env_id": args.env_id, "robot": args.robot, "camera": "base_camera", "episodes_done": 0}
+    meta = {"format": FORMAT, **asdict(args), "camera": "base_camera", "episodes_done": 0}
     if (path / "meta.json").exists():
         meta = json.loads((path / "meta.json").read_text())
     arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy") if meta["episodes_done"]}
@@ -227,25 +234,23 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
         return arrays
     envs, count = make_envs(args), args.num_episodes
     steps, (action_dim,) = envs.spec.max_episode_steps, envs.single_action_space.shape
+    actions = np.random.default_rng(args.seed).uniform(-1, 1, (count, steps, action_dim)).astype(np.float32)
     bar = tqdm(total=count * steps, initial=meta["episodes_done"] * steps, desc="random policy", unit="step")
     for first in range(meta["episodes_done"], count, envs.num_envs):
         now = np.arange(first, min(first + envs.num_envs, count))  # the episodes of this round
-        rngs = [np.random.default_rng([args.seed, episode]) for episode in now]
-        actions = np.stack([rng.uniform(-1, 1, (steps, action_dim)) for rng in rngs]).astype(np.float32)
         seeds = (args.seed * 1_000_000 + now) % 2**29 + 2**30
         obs, info = envs.reset(seed=np.resize(seeds, envs.num_envs).tolist())
         played = defaultdict(list, rgb=[obs["rgb"]], joints=[obs["joints"]], state=[info["state"]])
         for t in range(steps):
-            obs, reward, _, _, info = envs.step(np.resize(actions[:, t], (envs.num_envs, action_dim)))
+            obs, reward, _, _, info = envs.step(np.resize(actions[now, t], (envs.num_envs, action_dim)))
             for name, x in (*obs.items(), ("state", info["state"]), ("rewards", reward), ("success", info["success"])):
                 played[name].append(x)
             bar.update(len(now))
         played = {name: torch.stack([torch.as_tensor(x) for x in xs], 1) for name, xs in played.items()}
-        played |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(info["cue"])}
+        played |= {"actions": torch.from_numpy(actions[now]), "cue": torch.as_tensor(info["cue"])}
         if not arrays:
-            need, free = played["rgb"][0].nbytes * count, shutil.disk_usage(path.parent).free
-            if need > free:
-                fail(f"{path} needs {need / 1e9:.1f} GB, {free / 1e9:.1f} GB are free; lower --num-episodes")
+            if (size := played["rgb"][0].nbytes * count) > shutil.disk_usage(path.parent).free:
+                fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free; lower --num-episodes")
             path.mkdir(exist_ok=True)
             for name, x in played.items():
                 dtype, shape = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32), (count, *x.shape[1:])
@@ -272,10 +277,7 @@ def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> 
 
 
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """How well a linear map fitted on x (N, F), y (N, K) tells y_test from x_test, mean over the columns that vary.
-
-    Accuracy where y is few whole numbers (colours, shapes), else R2; the ridge is chosen by cross-validation.
-    """
+    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test."""
     varies = y.amax(0) > y.amin(0)
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
     classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
@@ -330,7 +332,6 @@ def main(args: Args) -> None:
     model = nn.ModuleDict({"phi": phi, "psi": psi, "g": g}).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     transitions, held_out = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
-    held_out = held_out[:: math.ceil(len(held_out) / 1000)]  # what fits into one batch
     per_epoch, first = math.ceil(len(transitions) / args.batch_size), 0
     if (path / "checkpoint.pt").exists():
         checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
@@ -353,10 +354,11 @@ def main(args: Args) -> None:
             bar.update()
 
         with torch.no_grad():
-            held_out_losses = repr_losses(model, read_transitions(dataset, held_out, device), args)
+            some = read_transitions(dataset, held_out[:: len(held_out) // 1000 + 1], device)
+            val_losses = repr_losses(model, some, args)
         for name, loss in losses.items():
             writer.add_scalar(f"losses/{name}", loss, bar.n)
-            writer.add_scalar(f"held_out/{name}", held_out_losses[name], bar.n)
+            writer.add_scalar(f"held_out/{name}", val_losses[name], bar.n)
         writer.flush()
         checkpoint = {"epoch": epoch + 1, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
         save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
@@ -364,8 +366,7 @@ def main(args: Args) -> None:
 
     report = diagnose_repr(phi.cpu(), torch.from_numpy(arrays["state"]), torch.from_numpy(arrays["cue"]), num_val)
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
-    content = {"kind": "repr", "env_id": args.env_id, "robot": args.robot, "num_val": num_val, "u_dim": args.u_dim}
-    save(path / "repr.pt", {**content, "phi": phi.state_dict()})
+    save(path / "repr.pt", {"kind": "repr", **asdict(args), "num_val": num_val, "phi": phi.state_dict()})
     print(f"{path / 'repr.pt'}: " + ", ".join(f"{name} {value:.3g}" for name, value in report.items()))
 
 
@@ -373,72 +374,122 @@ def main(args: Args) -> None:
 
 
 class TaskView(gym.Wrapper):
-    """Split what a task shows from what only the simulator knows, for a batch of B scenes.
+    """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
     Info, privileged: success (B,), state (B, D) without what is observable, cue (B, K), the memory variable itself.
-
-    On the CPU simulator it also lets hidden objects come back: MIKASA hides an object by writing z = 1000 into its pose
-    inside evaluate(), which on the GPU never reaches physics. So once the picture is taken, the old pose is put back.
     """
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
-        self.task, self.poses = env.unwrapped, {}
-        rgb, joints = self.task._init_raw_obs["rgb"], self.task._init_raw_obs["state"]
-        self.task.update_obs_space({"rgb": rgb[..., :3], "joints": joints})
-        task_evaluate = self.task.evaluate
+        self.task, self.poses, task_evaluate = env.unwrapped, {}, env.unwrapped.evaluate
 
         def evaluate() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        if not self.task.gpu_sim_enabled:
+        if not self.task.gpu_sim_enabled:  # on a CPU alone, an object that evaluate hides (z = 1000) would stay there
             self.task.evaluate = evaluate
+        self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
-    def _view(self, obs: dict, info: dict) -> tuple[dict, dict]:
-        mode, self.task._obs_mode = self.task._obs_mode, "state_dict"  # only then MIKASA adds the hidden facts
-        facts = self.task._get_obs_extra(info)
-        self.task._obs_mode = mode
-        facts.pop("tcp_pose")  # it is among the joints
-        state = common.flatten_state_dict(facts, use_torch=True).float()
-        state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
-        cue = self.task.oracle_info.float().reshape(len(state), -1)
+    def _view(self, facts: dict, info: dict) -> tuple[dict, dict]:
+        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
-        obs = {"rgb": obs["rgb"][..., :3].contiguous(), "joints": obs["state"]}
+        seen = {"agent": facts["agent"], "tcp_pose": facts["extra"].pop("tcp_pose")}
+        state = common.flatten_state_dict(facts["extra"], use_torch=True).float()
+        state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
+        cue = self.task.oracle_info.float().reshape(len(state), -1)
+        obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}
 
     def reset(self, **kwargs: object) -> tuple:
+        if not self.task.gpu_sim_enabled:  # part all bodies once, or PhysX's contacts carry over to the next episode
+            for i, actor in enumerate(a for a in self.task.scene.actors.values() if a.px_body_type == "dynamic"):
+                actor.pose = sapien.Pose([0, 0, 100 + 10 * i])
+            self.task.scene.step()
         return self._view(*self.env.reset(**kwargs))
 
     def step(self, action: torch.Tensor) -> tuple:
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        obs, info = self._view(obs, info)
+        facts, reward, terminated, truncated, info = self.env.step(action)
+        obs, info = self._view(facts, info)
         return obs, reward, terminated, truncated, info
+
+
+@contextmanager
+def light_shaders() -> Iterator[None]:
+    """Spare SAPIEN the table of a sky's reflections, most of a simulator's start on a CPU: there is no sky."""
+    set_shader_dir = sapien.render.set_camera_shader_dir
+    with tempfile.TemporaryDirectory() as folder:
+        pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
+        for file in Path(pack).glob("*.frag"):
+            lines = [line for line in file.read_text().splitlines() if "sampler2D samplerBRDFLUT;" not in line]
+            text = "\n".join(lines).replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)")
+            file.write_text(text)
+        if not any("samplerBRDFLUT" in file.read_text() for file in Path(pack).iterdir()):  # else they are not ours
+            sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
+        yield
+        sapien.render.set_camera_shader_dir = set_shader_dir
+
+
+def lighten_meshes(task: gym.Env, triangles: int) -> None:
+    """Draw the robot with about so many triangles per mesh, and the ground with two; objects of the task stay.
+
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
+    """
+    entities = [task.scene.actors["ground"]._objs[0], *(link._objs[0].entity for link in task.agent.robot.get_links())]
+    bodies = [entity.find_component_by_type(sapien.render.RenderBodyComponent) for entity in entities]
+    for old in filter(None, bodies):
+        new = sapien.render.RenderBodyComponent()
+        for shape in old.render_shapes:
+            for part in shape.parts:
+                points, faces = part.vertices, part.triangles
+                if old is bodies[0]:  # the ground is a flat grid
+                    corners = [(points[:, :2] @ side).argmax() for side in ((-1, -1), (1, -1), (-1, 1), (1, 1))]
+                    points, faces = points[corners], np.array([[0, 1, 2], [2, 1, 3]])
+                elif len(faces) > triangles:
+                    cells = (points / 0.004).round().astype(int) @ [1, 1 << 20, 1 << 40]  # of 4 mm: half a pixel
+                    _, first, cell = np.unique(cells, return_index=True, return_inverse=True)
+                    faces = cell[faces]
+                    faces = faces[(faces != np.roll(faces, 1, 1)).all(1)]
+                    count = min(triangles, len(faces))
+                    points, faces = fast_simplification.simplify(points[first], faces, target_count=count)
+                normals = trimesh.Trimesh(points, faces, process=False).vertex_normals
+                uvs = part.get_vertex_uv()[corners] if old is bodies[0] else np.zeros((len(points), 2))
+                light = sapien.render.RenderShapeTriangleMesh(points, faces, normals, uvs, part.material)
+                light.local_pose = shape.local_pose
+                new.attach(light)
+        old.entity.add_component(new)
+        old.entity.remove_component(old)
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
-    modes = dict(obs_mode="rgb", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
+    modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
     backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
-    env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
-    env = TaskView(wrappers.FlattenRGBDObservationWrapper(env, rgb=True, depth=False, state=True))
+    with light_shaders() if args.render_backend == "sapien_cpu" else nullcontext():
+        env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
+        env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
+        if args.mesh_triangles:
+            lighten_meshes(env.unwrapped, args.mesh_triangles)
+        env = TaskView(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
 
 def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Build the environments that play whole episodes in rounds, without auto-reset, arrays with a batch in front.
 
-    physx_cuda: one batch of args.num_envs scenes. physx_cpu: args.num_workers processes of one scene each.
+    physx_cuda: one batch of args.num_envs scenes. physx_cpu: args.num_workers processes of one scene each, all forked
+    from one that has done the imports, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
-    workers = [lambda: make_task(args, 1)] * args.num_workers
-    envs = gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
+    workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
+    multiprocessing.set_forkserver_preload([Path(__file__).stem])
+    envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     gym.logger.min_level = gym.logger.ERROR  # that a run is stopped in the middle of a step deserves no warning
     envs.spec = gym.spec(args.env_id)
@@ -477,7 +528,7 @@ def parse_args(tasks: dict[str, dict], quick: dict) -> Args:
     settings = tasks.get(chosen.env_id, {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
-        least = 0 if isinstance(value, bool | float) or name == "seed" else 1
+        least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:

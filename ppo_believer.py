@@ -17,19 +17,24 @@ import fcntl
 import io
 import json
 import math
+import multiprocessing
 import os
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
 
+import fast_simplification
 import gymnasium as gym
 import imageio.v3 as iio
 import matplotlib
@@ -39,6 +44,7 @@ import numpy as np
 import sapien
 import torch
 import torch.nn as nn
+import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
@@ -71,8 +77,10 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """panda renders 3 times faster on a CPU"""
-    num_workers: int = len(os.sched_getaffinity(0))
+    """with or without a camera at its wrist, through which the policy does not see"""
+    mesh_triangles: int = 0 if CUDA else 500
+    """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
+    num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; any number gives the same results"""
     quick: bool = False
     """a trial of a few minutes whose results mean nothing"""
@@ -152,7 +160,7 @@ TASKS = {  # Table 5, where it differs from the defaults above, which are Interc
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
-QUICK = dict(exp_name="ppo_believer_quick", robot="panda", total_timesteps=360, num_envs=2, num_eval_episodes=2)
+QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_eval_episodes=2)
 QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_updates=4, batch_episodes=4)
 
 
@@ -217,15 +225,13 @@ class StateEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the history o_0, a_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
-
-    Of the observations it always has the image; joints and actions where their sizes in config are not 0.
-    """
+    """h_t of the history o_0, a_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
+        # beside the image, joints and previous actions, where their sizes are not 0
         self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
         inputs = 512 + config["joints_dim"] + config["action_dim"]
         self.cnn = orthogonal_init(NatureCNN(config["image_shape"], 512, amp))
@@ -282,14 +288,11 @@ class BelieverBelief(nn.Module):
 
 
 class BeliefAgent(nn.Module):
-    """Actor and critic on image, joints and belief (paper 3.3): W(b) = W_agg(mean over particles of W_enc(u_i)).
-
-    The belief model is frozen: only the aggregator, W_enc and W_agg, learns with actor and critic.
-    """
+    """Actor and critic on image, joints and belief (paper 3.3): W(b) = W_agg(mean over particles of W_enc(u_i))."""
 
     def __init__(self, belief: nn.Module, joints_dim: int, action_dim: int, amp: bool = False):
         super().__init__()
-        self.belief = belief.requires_grad_(False)
+        self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(belief.config["image_shape"], 256, amp))
         self.joints = orthogonal_init(nn.Linear(joints_dim, 128))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -400,7 +403,8 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, QUICK["repr_dir"]):
         run_stage("aib_repr.py", args)
     hint = f"make it anew with aib_repr.py --env-id {args.env_id} --seed {args.seed} --overwrite"
-    stored = load(path / "repr.pt", hint, kind="repr", env_id=args.env_id, robot=args.robot)
+    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
+    stored = load(path / "repr.pt", hint, kind="repr", **task)
     try:
         names = ("rgb", "joints", "state", "actions", "cue")
         arrays = {name: np.load(path / "dataset" / f"{name}.npy", mmap_mode="r") for name in names}
@@ -409,8 +413,8 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     phi = StateEncoder(arrays["state"].shape[-1], stored["u_dim"])
     phi.load_state_dict(stored["phi"])
     with torch.no_grad():
-        u = phi(torch.from_numpy(arrays["state"][:])).mean
-    return Episodes(path / "dataset", u, torch.from_numpy(arrays["cue"][:]), torch.device(args.device)), stored
+        u = phi(torch.from_numpy(np.array(arrays["state"]))).mean
+    return Episodes(path / "dataset", u, torch.from_numpy(np.array(arrays["cue"])), torch.device(args.device)), stored
 
 
 @torch.no_grad()
@@ -461,10 +465,7 @@ def rollout_with_belief(
 
 
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """How well a linear map fitted on x (N, F), y (N, K) tells y_test from x_test, mean over the columns that vary.
-
-    Accuracy where y is few whole numbers (colours, shapes), else R2; the ridge is chosen by cross-validation.
-    """
+    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test."""
     varies = y.amax(0) > y.amin(0)
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
     classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
@@ -558,8 +559,7 @@ def make_video(data: dict[str, torch.Tensor]) -> bytes:
 def evaluate_with_belief(envs: gym.Env, agent: BeliefAgent, args: Args, known: dict) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    cue_readout: how well a linear read-out fitted on known, mean particles and cues of stage 2's episodes, tells the
-    cue from these episodes' mean particles. The belief was trained on random actions: does it hold under the policy?
+    cue_readout: how well a read-out fitted on known, mean particles and cues under random actions, tells the cue here.
     """
     torch.manual_seed(0)
     data = rollout_with_belief(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), explore=False)
@@ -645,7 +645,7 @@ def train_belief(args: Args, path: Path) -> None:
 
 def main(args: Args) -> None:
     """Train belief and agent of the Believer baseline, or with --evaluate only evaluate an agent."""
-    settings = ("env_id", "robot", "num_particles", "particle_noise")  # what agent.pt keeps of the arguments
+    settings = ("env_id", "robot", "mesh_triangles", "num_particles", "particle_noise")  # agent.pt keeps them
     if args.evaluate:
         file = Path(args.checkpoint.format(**vars(args)))
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_believer agent")
@@ -724,9 +724,9 @@ def main(args: Args) -> None:
             lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"kind": "ppo_believer agent", "config": stored["config"], "known": stored["known"]}
-            content |= {name: getattr(args, name) for name in settings}
-            save(path / "agent.pt", {**content, "global_step": global_step, "agent": agent.state_dict()})
+            content = {"config": stored["config"], "known": stored["known"], "agent": agent.state_dict()}
+            content |= {"kind": "ppo_believer agent", "global_step": global_step}
+            save(path / "agent.pt", {**asdict(args), **content})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
 
         for name, value in scalars.items():
@@ -746,72 +746,122 @@ def main(args: Args) -> None:
 
 
 class TaskView(gym.Wrapper):
-    """Split what a task shows from what only the simulator knows, for a batch of B scenes.
+    """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
     Info, privileged: success (B,), state (B, D) without what is observable, cue (B, K), the memory variable itself.
-
-    On the CPU simulator it also lets hidden objects come back: MIKASA hides an object by writing z = 1000 into its pose
-    inside evaluate(), which on the GPU never reaches physics. So once the picture is taken, the old pose is put back.
     """
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
-        self.task, self.poses = env.unwrapped, {}
-        rgb, joints = self.task._init_raw_obs["rgb"], self.task._init_raw_obs["state"]
-        self.task.update_obs_space({"rgb": rgb[..., :3], "joints": joints})
-        task_evaluate = self.task.evaluate
+        self.task, self.poses, task_evaluate = env.unwrapped, {}, env.unwrapped.evaluate
 
         def evaluate() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        if not self.task.gpu_sim_enabled:
+        if not self.task.gpu_sim_enabled:  # on a CPU alone, an object that evaluate hides (z = 1000) would stay there
             self.task.evaluate = evaluate
+        self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
-    def _view(self, obs: dict, info: dict) -> tuple[dict, dict]:
-        mode, self.task._obs_mode = self.task._obs_mode, "state_dict"  # only then MIKASA adds the hidden facts
-        facts = self.task._get_obs_extra(info)
-        self.task._obs_mode = mode
-        facts.pop("tcp_pose")  # it is among the joints
-        state = common.flatten_state_dict(facts, use_torch=True).float()
-        state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
-        cue = self.task.oracle_info.float().reshape(len(state), -1)
+    def _view(self, facts: dict, info: dict) -> tuple[dict, dict]:
+        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
-        obs = {"rgb": obs["rgb"][..., :3].contiguous(), "joints": obs["state"]}
+        seen = {"agent": facts["agent"], "tcp_pose": facts["extra"].pop("tcp_pose")}
+        state = common.flatten_state_dict(facts["extra"], use_torch=True).float()
+        state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
+        cue = self.task.oracle_info.float().reshape(len(state), -1)
+        obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}
 
     def reset(self, **kwargs: object) -> tuple:
+        if not self.task.gpu_sim_enabled:  # part all bodies once, or PhysX's contacts carry over to the next episode
+            for i, actor in enumerate(a for a in self.task.scene.actors.values() if a.px_body_type == "dynamic"):
+                actor.pose = sapien.Pose([0, 0, 100 + 10 * i])
+            self.task.scene.step()
         return self._view(*self.env.reset(**kwargs))
 
     def step(self, action: torch.Tensor) -> tuple:
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        obs, info = self._view(obs, info)
+        facts, reward, terminated, truncated, info = self.env.step(action)
+        obs, info = self._view(facts, info)
         return obs, reward, terminated, truncated, info
+
+
+@contextmanager
+def light_shaders() -> Iterator[None]:
+    """Spare SAPIEN the table of a sky's reflections, most of a simulator's start on a CPU: there is no sky."""
+    set_shader_dir = sapien.render.set_camera_shader_dir
+    with tempfile.TemporaryDirectory() as folder:
+        pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
+        for file in Path(pack).glob("*.frag"):
+            lines = [line for line in file.read_text().splitlines() if "sampler2D samplerBRDFLUT;" not in line]
+            text = "\n".join(lines).replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)")
+            file.write_text(text)
+        if not any("samplerBRDFLUT" in file.read_text() for file in Path(pack).iterdir()):  # else they are not ours
+            sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
+        yield
+        sapien.render.set_camera_shader_dir = set_shader_dir
+
+
+def lighten_meshes(task: gym.Env, triangles: int) -> None:
+    """Draw the robot with about so many triangles per mesh, and the ground with two; objects of the task stay.
+
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
+    """
+    entities = [task.scene.actors["ground"]._objs[0], *(link._objs[0].entity for link in task.agent.robot.get_links())]
+    bodies = [entity.find_component_by_type(sapien.render.RenderBodyComponent) for entity in entities]
+    for old in filter(None, bodies):
+        new = sapien.render.RenderBodyComponent()
+        for shape in old.render_shapes:
+            for part in shape.parts:
+                points, faces = part.vertices, part.triangles
+                if old is bodies[0]:  # the ground is a flat grid
+                    corners = [(points[:, :2] @ side).argmax() for side in ((-1, -1), (1, -1), (-1, 1), (1, 1))]
+                    points, faces = points[corners], np.array([[0, 1, 2], [2, 1, 3]])
+                elif len(faces) > triangles:
+                    cells = (points / 0.004).round().astype(int) @ [1, 1 << 20, 1 << 40]  # of 4 mm: half a pixel
+                    _, first, cell = np.unique(cells, return_index=True, return_inverse=True)
+                    faces = cell[faces]
+                    faces = faces[(faces != np.roll(faces, 1, 1)).all(1)]
+                    count = min(triangles, len(faces))
+                    points, faces = fast_simplification.simplify(points[first], faces, target_count=count)
+                normals = trimesh.Trimesh(points, faces, process=False).vertex_normals
+                uvs = part.get_vertex_uv()[corners] if old is bodies[0] else np.zeros((len(points), 2))
+                light = sapien.render.RenderShapeTriangleMesh(points, faces, normals, uvs, part.material)
+                light.local_pose = shape.local_pose
+                new.attach(light)
+        old.entity.add_component(new)
+        old.entity.remove_component(old)
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
-    modes = dict(obs_mode="rgb", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
+    modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
     backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
-    env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
-    env = TaskView(wrappers.FlattenRGBDObservationWrapper(env, rgb=True, depth=False, state=True))
+    with light_shaders() if args.render_backend == "sapien_cpu" else nullcontext():
+        env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
+        env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
+        if args.mesh_triangles:
+            lighten_meshes(env.unwrapped, args.mesh_triangles)
+        env = TaskView(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
 
 def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Build the environments that play whole episodes in rounds, without auto-reset, arrays with a batch in front.
 
-    physx_cuda: one batch of args.num_envs scenes. physx_cpu: args.num_workers processes of one scene each.
+    physx_cuda: one batch of args.num_envs scenes. physx_cpu: args.num_workers processes of one scene each, all forked
+    from one that has done the imports, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
-    workers = [lambda: make_task(args, 1)] * args.num_workers
-    envs = gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
+    workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
+    multiprocessing.set_forkserver_preload([Path(__file__).stem])
+    envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     gym.logger.min_level = gym.logger.ERROR  # that a run is stopped in the middle of a step deserves no warning
     envs.spec = gym.spec(args.env_id)
@@ -850,7 +900,7 @@ def parse_args(tasks: dict[str, dict], quick: dict) -> Args:
     settings = tasks.get(chosen.env_id, {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
-        least = 0 if isinstance(value, bool | float) or name == "seed" else 1
+        least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
@@ -908,7 +958,7 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 def run_stage(script: str, args: Args) -> None:
     """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and --quick."""
     command = [sys.executable, str(Path(__file__).with_name(script))] + ["--quick"] * args.quick
-    for name in ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "num_workers"):
+    for name in ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
     # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it

@@ -16,7 +16,7 @@ from conftest import TASK, run
 def test_dataset(quick_runs: Path) -> None:
     data = quick_runs / f"{TASK}__aib_repr_quick__1" / "dataset"
     meta = json.loads((data / "meta.json").read_text())
-    assert (meta["env_id"], meta["robot"], meta["episodes_done"]) == (TASK, "panda", 8)
+    assert (meta["env_id"], meta["mesh_triangles"], meta["episodes_done"]) == (TASK, 500, 8)
     arrays = {file.stem: np.load(file) for file in data.glob("*.npy")}
     state_dim = arrays["state"].shape[-1]
     expected = {
