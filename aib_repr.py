@@ -74,8 +74,8 @@ class Args:
     overwrite: bool = False
     """delete what the run directory holds and start anew"""
 
-    num_envs: int = 250
-    """scenes simulated at a time on physx_cuda"""
+    num_envs: int = 50
+    """scenes simulated at a time on physx_cuda, which draws one arm pose for all of them"""
     num_episodes: int = 1000
     """episodes of the random policy"""
     val_share: float = 0.05
@@ -234,20 +234,21 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
         return arrays
     envs, count = make_envs(args), args.num_episodes
     steps, (action_dim,) = envs.spec.max_episode_steps, envs.single_action_space.shape
-    actions = np.random.default_rng(args.seed).uniform(-1, 1, (count, steps, action_dim)).astype(np.float32)
     bar = tqdm(total=count * steps, initial=meta["episodes_done"] * steps, desc="random policy", unit="step")
     for first in range(meta["episodes_done"], count, envs.num_envs):
         now = np.arange(first, min(first + envs.num_envs, count))  # the episodes of this round
+        rngs = [np.random.default_rng([args.seed, episode]) for episode in now]
+        actions = np.stack([rng.uniform(-1, 1, (steps, action_dim)) for rng in rngs]).astype(np.float32)
         seeds = (args.seed * 1_000_000 + now) % 2**29 + 2**30
         obs, info = envs.reset(seed=np.resize(seeds, envs.num_envs).tolist())
         played = defaultdict(list, rgb=[obs["rgb"]], joints=[obs["joints"]], state=[info["state"]])
         for t in range(steps):
-            obs, reward, _, _, info = envs.step(np.resize(actions[now, t], (envs.num_envs, action_dim)))
+            obs, reward, _, _, info = envs.step(np.resize(actions[:, t], (envs.num_envs, action_dim)))
             for name, x in (*obs.items(), ("state", info["state"]), ("rewards", reward), ("success", info["success"])):
                 played[name].append(x)
             bar.update(len(now))
         played = {name: torch.stack([torch.as_tensor(x) for x in xs], 1) for name, xs in played.items()}
-        played |= {"actions": torch.from_numpy(actions[now]), "cue": torch.as_tensor(info["cue"])}
+        played |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(info["cue"])}
         if not arrays:
             if (size := played["rgb"][0].nbytes * count) > shutil.disk_usage(path.parent).free:
                 fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free; lower --num-episodes")
@@ -405,10 +406,6 @@ class TaskView(gym.Wrapper):
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}
 
     def reset(self, **kwargs: object) -> tuple:
-        if not self.task.gpu_sim_enabled:  # part all bodies once, or PhysX's contacts carry over to the next episode
-            for i, actor in enumerate(a for a in self.task.scene.actors.values() if a.px_body_type == "dynamic"):
-                actor.pose = sapien.Pose([0, 0, 100 + 10 * i])
-            self.task.scene.step()
         return self._view(*self.env.reset(**kwargs))
 
     def step(self, action: torch.Tensor) -> tuple:

@@ -394,10 +394,6 @@ class TaskView(gym.Wrapper):
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}
 
     def reset(self, **kwargs: object) -> tuple:
-        if not self.task.gpu_sim_enabled:  # part all bodies once, or PhysX's contacts carry over to the next episode
-            for i, actor in enumerate(a for a in self.task.scene.actors.values() if a.px_body_type == "dynamic"):
-                actor.pose = sapien.Pose([0, 0, 100 + 10 * i])
-            self.task.scene.step()
         return self._view(*self.env.reset(**kwargs))
 
     def step(self, action: torch.Tensor) -> tuple:

@@ -37,7 +37,7 @@ def main(args: Args) -> None:
     print("| task | steps | image | joints | state | cue | seconds | result |\n|" + "---|" * 8)
     failed = 0
     for task in args.tasks or tasks_without_download():
-        env = ppo_baseline.make_task(ppo_baseline.Args(env_id=task, robot="panda"), 1)
+        env = ppo_baseline.make_task(ppo_baseline.Args(env_id=task), 1)
         obs, info = env.reset(seed=0)
         sizes = [ppo_baseline.gym.spec(task).max_episode_steps, "x".join(map(str, obs["rgb"].shape))]
         sizes += [obs["joints"].size, info["state"].size, info["cue"].size]

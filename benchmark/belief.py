@@ -49,8 +49,8 @@ class Args:
     """MIKASA-Robo task"""
     rows: list[str] = field(default_factory=lambda: ["flow", "mse", "none", "plain", "believer"])
     """which rows of the table"""
-    robot: str = "panda"
-    """panda renders 3 times faster on a CPU than panda_wristcam"""
+    robot: str = "panda_wristcam"
+    """robot of the scripts"""
     num_episodes: int = 320
     """episodes of the random policy, a tenth of them held out"""
     epochs: int = 13

@@ -1,24 +1,28 @@
 """How fast, as ratios measured in one run: `make bench`.
 
-Stage 2's update against a per-step loop; rollout and update of ppo_baseline.py against the agent and the buffers of
-MIKASA-Robo's own PPO script on the same simulator and sizes; what of a rollout is simulator; scaling with workers.
+A simulator's start, step and pictures against MIKASA-Robo's stock environment; steps/s of a rollout of ppo_aib.py by
+cores; stage 2's update against a per-step loop; rollout and update of ppo_baseline.py against the agent and the buffers
+of MIKASA-Robo's own PPO script on the same simulator and sizes; what of a rollout is simulator.
 
 Usage:   python benchmark/speed.py
          python benchmark/speed.py --env-id InterceptFast-v0 --episodes 16
 """
 
+import multiprocessing
 import os
 import resource
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
 
+import gymnasium as gym
 import numpy as np
 import torch
 import tyro
@@ -30,14 +34,14 @@ import belief  # noqa: E402
 import ppo_aib  # noqa: E402
 import ppo_baseline  # noqa: E402
 
+CONFIG = {"image_shape": [128, 128, 3], "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
+
 
 @dataclass
 class Args:
     env_id: str = "RememberShapeAndColor3x2-v0"
     """MIKASA-Robo task"""
-    robot: Literal["panda", "panda_wristcam"] = "panda"
-    """panda renders 3 times faster on a CPU"""
-    episodes: int = 8
+    episodes: int = 16
     """episodes per rollout"""
     repeats: int = 3
     """measurements of each, of which the median counts"""
@@ -130,11 +134,79 @@ def timed(function: Callable, *arguments: object) -> tuple[object, float]:
     return function(*arguments), time.perf_counter() - start
 
 
+def simulate(kind: str, env_id: str, robot: str) -> tuple[float, float, np.ndarray]:
+    """CPU-seconds to build and reset one simulator, median seconds of a step, and 21 pictures (21, H, W, 3).
+
+    kind: stock, MIKASA-Robo's environment; ours; heavy, ours with SAPIEN's own shaders and meshes.
+    """
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    torch.set_num_threads(1)
+    start = time.process_time()
+    if kind == "stock":
+        modes = dict(obs_mode="rgb", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
+        backends = dict(sim_backend="physx_cpu", render_backend="sapien_cpu")
+        env = gym.make(env_id, num_envs=1, robot_uids=robot, **modes, **backends)
+        env = ppo_baseline.wrappers.FlattenRGBDObservationWrapper(env, rgb=True, depth=False, state=True)
+        env = ppo_baseline.wrappers.CPUGymWrapper(env, ignore_terminations=True)
+    else:
+        if kind == "heavy":
+            ppo_baseline.light_shaders = nullcontext
+        triangles = 500 * (kind == "ours")
+        env = ppo_baseline.make_task(ppo_baseline.Args(env_id=env_id, robot=robot, mesh_triangles=triangles), 1)
+    pictures, seconds, rng = [env.reset(seed=1)[0]["rgb"]], [], np.random.default_rng(0)
+    start = time.process_time() - start
+    for _ in range(20):
+        action = rng.uniform(-1, 1, 8).astype(np.float32)
+        (obs, *_), duration = timed(env.step, action)
+        pictures.append(obs["rgb"])
+        seconds.append(duration)
+    return start, statistics.median(seconds), np.stack(pictures)
+
+
+def rollout_rate(env_id: str, cores: set[int], episodes: int) -> float:
+    """Steps/s of a rollout of ppo_aib.py on the given cores, the faster of two."""
+    os.sched_setaffinity(0, cores)
+    torch.set_num_threads(len(cores))
+    args = ppo_aib.Args(env_id=env_id, num_workers=2 * len(cores))
+    envs = ppo_aib.make_envs(args)
+    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG), 25, 8)
+    seeds = np.arange(episodes)
+    seconds = [timed(ppo_aib.rollout_with_belief, envs, agent, args, seeds)[1] for _ in range(2)]
+    envs.close()
+    return episodes * envs.spec.max_episode_steps / min(seconds)
+
+
+def afresh(function: Callable, *arguments: object) -> object:
+    """What a function returns in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def simulator_rows(args: Args) -> Iterator[tuple[str, str]]:
+    """What our simulator costs against the stock one, and what its pictures lose."""
+    for env_id in ("InterceptFast-v0", "RememberColor9-v0"):
+        for robot in ("panda_wristcam", "panda"):
+            stock, ours = (afresh(simulate, kind, env_id, robot) for kind in ("stock", "ours"))
+            text = f"step {stock[1] / ours[1]:.1f} x as fast as stock ({1000 * stock[1]:.0f} / {1000 * ours[1]:.1f} ms)"
+            text += f", start {ours[0] / stock[0]:.2f} of stock's CPU time ({stock[0]:.1f} s, {ours[0]:.1f} s)"
+            yield f"one simulator, {env_id}, {robot}", text
+    tasks = ["InterceptFast", "RememberColor9", "RememberShapeAndColor3x2", "TakeItBack", "ChainOfColors7"]
+    for env_id in (f"{task}-v0" for task in tasks):
+        heavy, ours = (afresh(simulate, kind, env_id, "panda_wristcam")[2].astype(int) for kind in ("heavy", "ours"))
+        difference = np.abs(heavy - ours)
+        share, mean = (difference.max(-1) > 16).mean(), difference.mean()
+        yield f"pictures, {env_id}", f"{share:.2%} of pixels differ by more than 16, mean difference {mean:.2f}"
+    cores = sorted(os.sched_getaffinity(0))
+    one, every = (afresh(rollout_rate, args.env_id, set(use), args.episodes) for use in (cores[:1], cores))
+    yield f"rollout of AIB, {args.env_id}", f"{one:.0f} steps/s on 1 core, {every:.0f} on {len(cores)}"
+
+
 def rows(args: Args) -> Iterator[tuple[str, str]]:
     """Measure, and give the table row by row."""
+    yield from simulator_rows(args)
     yield "stage 2", belief.speed(torch.device("cpu"))
     cores = len(os.sched_getaffinity(0))
-    settings = ppo_baseline.Args(env_id=args.env_id, robot=args.robot, num_minibatches=8, num_workers=cores)
+    settings = ppo_baseline.Args(env_id=args.env_id, num_minibatches=8)
     seeds, envs = np.arange(args.episodes), ppo_baseline.make_envs(settings)
     clock = Clock(envs)
     image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
@@ -155,11 +227,9 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
     bytes_ours, bytes_theirs = data["rgb"].nbytes, their_data["rgb"].nbytes
     yield "plain PPO, image buffer", f"{bytes_ours / 1e6:.0f} MB against {bytes_theirs / 1e6:.0f} MB"
 
-    config = {"image_shape": list(image_shape), "joints_dim": 0, "action_dim": 0, "gru_layers": 1}
-    config |= {"u_dim": 16, "z_dim": 32}
     shares = {"plain PPO": (ppo_baseline.rollout, agent)}
     for name, amp in (("AIB", False), ("AIB, --amp", True)):
-        believing = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(config, amp), joints_dim, action_dim, amp)
+        believing = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG, amp), joints_dim, action_dim, amp)
         shares[name] = (ppo_aib.rollout_with_belief, believing)
     for name, (play, player) in shares.items():
         measured = []
@@ -171,7 +241,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
     envs.close()
 
     rates = {}
-    for workers in range(1, cores + 1):
+    for workers in (1, cores, 2 * cores, 4 * cores):
         settings.num_workers = workers
         envs = ppo_baseline.make_envs(settings)
         rates[workers] = 1 / min(timed(ppo_baseline.rollout, envs, agent, settings, seeds)[1] for _ in range(2))
@@ -183,7 +253,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
 
 def main(args: Args) -> None:
     """Print the table."""
-    print(f"{args.env_id}, {args.robot}, {args.episodes} episodes, {len(os.sched_getaffinity(0))} cores\n")
+    print(f"{args.env_id}, {args.episodes} episodes, {len(os.sched_getaffinity(0))} cores\n")
     print("| what | measured |\n|---|---|")
     for name, text in rows(args):
         print(f"| {name} | {text} |", flush=True)

@@ -38,8 +38,8 @@ def make_stage_1(folder: Path, episodes: int) -> int:
     arrays |= {"actions": rng.uniform(-1, 1, (episodes, 10, 2)), "cue": rng.integers(3, size=(episodes, 1))}
     for name, array in arrays.items():
         np.save(path / "dataset" / f"{name}.npy", array.astype(np.float32))
-    content = {"kind": "repr", "env_id": TOY, "robot": "panda_wristcam", "num_val": 8, "u_dim": 4}
-    aib_repr.save(path / "repr.pt", {**content, "phi": aib_repr.StateEncoder(4, 4).state_dict()})
+    content = {"kind": "repr", "env_id": TOY, "robot": "panda_wristcam", "mesh_triangles": 500, "num_val": 8}
+    aib_repr.save(path / "repr.pt", {**content, "u_dim": 4, "phi": aib_repr.StateEncoder(4, 4).state_dict()})
     return rgb.nbytes
 
 
