@@ -1,0 +1,82 @@
+"""Does a belief trained on light pictures read the cue from stock pictures, and how well from its own?
+
+Trains stage 1 and the belief on decimated meshes, then collects held-out episodes of another seed twice, with light and
+with untouched meshes, and fits the cue's read-out on light training episodes only. Runs are kept in runs/*meshes*.
+
+Usage:   python benchmark/meshes.py
+"""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn as nn
+import tyro
+
+ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT))
+import aib_belief  # noqa: E402
+
+
+@dataclass
+class Args:
+    env_id: str = "RememberColor3-v0"
+    """MIKASA-Robo task"""
+    num_episodes: int = 320
+    """light episodes to train on"""
+    num_updates: int = 240
+    """of stage 2, of 16 episodes"""
+    num_test: int = 64
+    """episodes of either kind to test on"""
+
+
+def run(*command: str) -> None:
+    """Run a script with its progress showing."""
+    code = subprocess.run([sys.executable, str(ROOT / command[0]), *command[1:]]).returncode
+    if code:
+        sys.exit(code)
+
+
+def main(args: Args) -> None:
+    """Run what is missing and print the read-outs."""
+    task = ["--env-id", args.env_id]
+    stage1 = ["--batch-size", "100", "--learning-rate", "1e-3", "--exp-name", "meshes_repr", "--val-share", "0.1"]
+    run("aib_repr.py", *task, *stage1, "--num-episodes", str(args.num_episodes), "--epochs", "13")
+    runs = Path("runs")
+    repr_dir = runs / f"{args.env_id}__meshes_repr__1"
+    stage2 = ["--num-updates", str(args.num_updates), "--batch-episodes", "16", "--belief-lr", "1e-3"]
+    run("aib_belief.py", *task, *stage2, "--exp-name", "meshes_belief", "--repr-dir", str(repr_dir))
+    for triangles in (500, 0):
+        test = ["--num-episodes", str(args.num_test), "--epochs", "1", "--seed", "2", "--val-share", "0.5"]
+        run("aib_repr.py", *task, *test, "--mesh-triangles", str(triangles), "--exp-name", f"meshes_test_{triangles}")
+
+    stored = torch.load(runs / f"{args.env_id}__meshes_belief__1" / "belief.pt", weights_only=True)
+    stage1 = torch.load(repr_dir / "repr.pt", weights_only=True)
+    phi = aib_belief.StateEncoder(len(stage1["phi"]["mean"]), stage1["u_dim"])
+    phi.load_state_dict(stage1["phi"])
+    model = nn.ModuleDict({"belief": aib_belief.AIBBelief(stored["config"])})
+    model["posterior"] = aib_belief.GaussianMLP(stage1["u_dim"] + 256, [256, 256], stored["z_dim"], min_std=0.1)
+    model.load_state_dict({name: x for name, x in stored["training"].items() if not name.startswith("head")})
+
+    def encode(path: Path, count: int) -> dict[str, torch.Tensor]:
+        state, cue = (torch.from_numpy(np.load(path / "dataset" / f"{name}.npy")) for name in ("state", "cue"))
+        with torch.no_grad():
+            episodes = aib_belief.Episodes(path / "dataset", phi(state).mean, cue, torch.device("cpu"))
+        return aib_belief.encode(model["belief"], model["posterior"], episodes, np.arange(count))
+
+    fit = encode(repr_dir, args.num_episodes)
+    report = {}
+    for name, triangles in (("light", 500), ("stock", 0)):
+        test = encode(runs / f"{args.env_id}__meshes_test_{triangles}__2", args.num_test)
+        pairs = zip(fit["particle"].unbind(1), test["particle"].unbind(1), strict=True)
+        scores = [aib_belief.readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in pairs]
+        report[name] = {"last step": scores[-1], "mean over steps": float(np.mean(scores))}
+    print(json.dumps(report, indent=2))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
