@@ -139,8 +139,6 @@ def simulate(kind: str, env_id: str, robot: str) -> tuple[float, float, np.ndarr
 
     kind: stock, MIKASA-Robo's environment; ours; heavy, ours with SAPIEN's own shaders and meshes.
     """
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")
-    torch.set_num_threads(1)
     start = time.process_time()
     if kind == "stock":
         modes = dict(obs_mode="rgb", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
@@ -177,7 +175,8 @@ def rollout_rate(env_id: str, cores: set[int], episodes: int) -> float:
 
 
 def afresh(function: Callable, *arguments: object) -> object:
-    """What a function returns in a process of its own."""
+    """What a function returns in a process of its own, with one thread for each library as in the scripts' workers."""
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
 
