@@ -437,6 +437,8 @@ def main(args: Args) -> None:
         frames = np.array(rgb[: len(train)][:128, ::8], np.float32)  # a sample that fits into memory
         history.image_mean = torch.from_numpy(frames.mean((0, 1)))
         history.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
+    ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX: glibc keeps large tensors instead of asking for them anew,
+    ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: an update is a third faster on a CPU
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first, best_nll, best = 0, math.inf, None

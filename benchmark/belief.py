@@ -7,6 +7,7 @@ Usage:   python benchmark/belief.py                                  (RememberCo
          python benchmark/belief.py --env-id InterceptFast-v0 --rows flow "flow lambda 0.1" "flow lambda 10"
 """
 
+import ctypes
 import json
 import statistics
 import subprocess
@@ -81,6 +82,8 @@ def speed(device: torch.device) -> str:
     model = nn.ModuleDict({"belief": aib_belief.AIBBelief(config)})
     model["posterior"] = aib_belief.GaussianMLP(16 + 256, [256, 256], 32, min_std=0.1)
     model["head"] = aib_belief.mlp([2 * 32 + 8 + 1, 256, 8])
+    ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX: as in aib_belief.main
+    ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: likewise
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=3e-4, fused=True)
     batch = {"rgb": torch.randint(0, 256, (steps + 1, episodes, 128, 128, 3), dtype=torch.uint8, device=device)}
