@@ -55,11 +55,11 @@ def main(args: Args) -> None:
         run("aib_repr.py", *task, *test, "--mesh-triangles", str(triangles), "--exp-name", f"meshes_test_{triangles}")
 
     stored = torch.load(runs / f"{args.env_id}__meshes_belief__1" / "belief.pt", weights_only=True)
-    stage1 = torch.load(repr_dir / "repr.pt", weights_only=True)
-    phi = aib_belief.StateEncoder(len(stage1["phi"]["mean"]), stage1["u_dim"])
-    phi.load_state_dict(stage1["phi"])
+    stored_repr = torch.load(repr_dir / "repr.pt", weights_only=True)
+    phi = aib_belief.StateEncoder(len(stored_repr["phi"]["mean"]), stored_repr["u_dim"])
+    phi.load_state_dict(stored_repr["phi"])
     model = nn.ModuleDict({"belief": aib_belief.AIBBelief(stored["config"])})
-    model["posterior"] = aib_belief.GaussianMLP(stage1["u_dim"] + 256, [256, 256], stored["z_dim"], min_std=0.1)
+    model["posterior"] = aib_belief.GaussianMLP(stored_repr["u_dim"] + 256, [256, 256], stored["z_dim"], min_std=0.1)
     model.load_state_dict({name: x for name, x in stored["training"].items() if not name.startswith("head")})
 
     def encode(path: Path, count: int) -> dict[str, torch.Tensor]:
