@@ -19,10 +19,10 @@ run: setup
 test: setup
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
-	$(PY) -m pytest -m "not thorough"
+	$(PY) -m pytest --numprocesses auto --dist loadgroup -m "not thorough"
 
 test-all: setup
-	$(PY) -m pytest
+	$(PY) -m pytest --numprocesses auto --dist loadgroup
 
 bench: setup
 	$(PY) -m pip install --quiet --no-deps colorama  # MIKASA-Robo's own PPO script wants it

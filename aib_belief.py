@@ -35,15 +35,18 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import torch.nn as nn
+import torch.utils.checkpoint
 import tyro
 from sklearn import linear_model, pipeline, preprocessing
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 2  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FRAMES = 2048  # images through a belief's CNN at a time: their activations take some 2 GB
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported() if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
 # ---------------------------------------------------------------- arguments
@@ -69,13 +72,17 @@ class Args:
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; any number gives the same results"""
+    small: bool = False
+    """smaller than the paper, for a few CPU cores and hours; found on RememberColor3-v0"""
     quick: bool = False
-    """a trial of a few minutes whose results mean nothing"""
+    """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
     """delete what the run directory holds and start anew"""
 
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
+    num_episodes: int = 1000
+    """episodes of the random policy, where stage 1 has still to collect them"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper calls them epochs"""
     batch_episodes: int = 256
@@ -90,8 +97,8 @@ class Args:
     """inverse dynamics by flow matching, by regression, or none"""
     action_lambda: float = 1.0
     """weight of the action head's loss"""
-    fm_latent: Literal["sample", "mean"] = "sample"
-    """what the action head sees of the posterior"""
+    fm_latent: Literal["mean", "sample"] = "mean"
+    """what the action head sees of the posterior; from samples, the paper's text, it learns nothing at the start"""
     bptt_steps: int | None = None
     """cut back-propagation through time after so many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
@@ -100,8 +107,8 @@ class Args:
     """GRU gates that start out remembering for up to an episode (Tallec and Ollivier, 2018)"""
     gru_layers: int = 1
     """layers of the GRU"""
-    history_joints: bool = False
-    """joints in the history"""
+    history_joints: bool = True
+    """joints in the history, as in the paper; its authors' code has the image alone"""
     history_actions: bool = False
     """previous actions in the history; then z can carry them with no regard for the world"""
     belief_amp: bool = BFLOAT16
@@ -110,7 +117,9 @@ class Args:
     """updates between looks at the held-out episodes; the best weights are kept"""
 
 
-QUICK = dict(exp_name="aib_belief_quick", num_updates=4, batch_episodes=4)
+SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=300, batch_episodes=16, belief_lr=1e-3)
+SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
+QUICK = dict(exp_name="aib_belief_quick", num_episodes=8, num_updates=4, batch_episodes=4)
 QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 
 
@@ -181,6 +190,8 @@ class HistoryEncoder(nn.Module):
         super().__init__()
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
+        self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
+        self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
         # beside the image, joints and previous actions, where their sizes are not 0
         self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
         inputs = 512 + config["joints_dim"] + config["action_dim"]
@@ -188,18 +199,25 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
 
+    def embed(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Images (B, H, W, 3) uint8 -> features (B, 512)."""
+        return self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+
     def forward(
         self, batch: dict[str, torch.Tensor], memory: torch.Tensor | None = None, bptt_steps: int | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Encode T steps of B histories that go on from memory, the GRU's state: -> h (T, B, 256), memory.
 
         batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J), previous (T, B, A), the action before each observation.
-        All T * B frames go through the CNN in one call; T = 1 is the step path of PPO.
+        All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in
+        chunks that the backward pass computes once more. T = 1 is the step path of PPO.
         """
-        images = batch["rgb"].flatten(0, 1).float().sub_(self.image_mean).div_(self.image_std)
-        x = self.cnn(images).view(*batch["rgb"].shape[:2], -1)
+        chunks = batch["rgb"].flatten(0, 1).split(FRAMES)
+        again = partial(torch.utils.checkpoint.checkpoint, self.embed, use_reentrant=False)
+        x = torch.cat([again(chunk) for chunk in chunks]) if len(chunks) > 1 else self.embed(chunks[0])
+        x = x.view(*batch["rgb"].shape[:2], -1)
         if self.use_joints:
-            x = torch.cat([x, batch["joints"]], -1)
+            x = torch.cat([x, (batch["joints"] - self.joints_mean) / self.joints_std], -1)
         if self.use_actions:
             x = torch.cat([x, batch["previous"]], -1)
         outputs = []
@@ -303,7 +321,7 @@ class Episodes:
 def load_episodes(args: Args) -> tuple[Episodes, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, QUICK["repr_dir"]):
+    if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"]):
         run_stage("aib_repr.py", args)
     hint = f"make it anew with aib_repr.py --env-id {args.env_id} --seed {args.seed} --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
@@ -324,8 +342,13 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
 
 
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test."""
+    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
+
+    The ridge is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    """
     varies = y.amax(0) > y.amin(0)
+    if not varies.any():
+        return math.nan
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
     classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
     model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
@@ -337,7 +360,7 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
 def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: np.ndarray) -> dict[str, torch.Tensor]:
     """What the belief makes of episodes index (E,), each (E, T+1, .): h, u, action (E, T, A), cue (E, K), and
 
-    particle: the mean of 30 decoded prior samples; q: the posterior's mean; posterior: its decoding;
+    particle: the mean of 30 decoded prior samples; z, q: a sample and the mean of the posterior; posterior: q decoded;
     nll_prior: -log p(u|h) (E, T+1), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows
     of three possible places is right about each; nll_posterior: -log p(u|z,h) under one z of the posterior.
     """
@@ -346,10 +369,10 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
         u, (h, _) = batch["u"], belief.history(batch)
-        nll, _, _, mean = elbo_terms(belief, posterior, u, h)
+        nll, _, z, mean = elbo_terms(belief, posterior, u, h)
         decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
-        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "q": mean, "nll_posterior": nll}
+        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "q": mean, "nll_posterior": nll}
         part["nll_prior"] = math.log(30) - log_p.logsumexp(-1)
         part["posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
         part = {name: x.transpose(0, 1) for name, x in {**part, "action": batch["actions"]}.items()}
@@ -358,7 +381,11 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
 
 
 def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) -> dict:
-    """What the belief remembers, lists by time step; fit and test: encode's of training and held-out episodes."""
+    """What the belief remembers, lists by time step.
+
+    fit and test are encode's of two sets of episodes that the belief was not trained on: read-outs are fitted on the
+    first and everything is measured on the second.
+    """
     nll, nll_posterior = test["nll_prior"].mean().item(), test["nll_posterior"].mean().item()
     report = {"nll_prior": nll, "nll_posterior": nll_posterior, "prior_gap": nll - nll_posterior}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
@@ -376,15 +403,15 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
 
 
 @torch.no_grad()
-def flow_gain(head: nn.Module, q: torch.Tensor, action: torch.Tensor) -> float:
-    """L_FM with the z of other episodes minus L_FM with the right ones; q (E, T+1, z_dim), action (E, T, A).
+def flow_gain(head: nn.Module, z: torch.Tensor, action: torch.Tensor) -> tuple[float, float]:
+    """L_FM, and how much larger it is with the z of other episodes; z (E, T+1, z_dim), action (E, T, A).
 
-    Near 0 the action head reads nothing from z, and so shapes nothing.
+    With a gain near 0 the action head reads nothing from z, and so shapes nothing.
     """
     torch.manual_seed(0)
     noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
-    wrong, right = (flow_matching_loss(head, action, z[:, :-1], z[:, 1:], noise, tau).mean() for z in (q.roll(1, 0), q))
-    return (wrong - right).item()
+    right, wrong = (flow_matching_loss(head, action, x[:, :-1], x[:, 1:], noise, tau).mean() for x in (z, z.roll(1, 0)))
+    return right.item(), (wrong - right).item()
 
 
 def plot_diagnostics(report: dict, title: str) -> bytes:
@@ -417,7 +444,8 @@ def main(args: Args) -> None:
         print(f"{path / 'belief.pt'} is finished; --overwrite makes it anew")
         return
     episodes, stored = load_episodes(args)
-    train, val = np.split(np.arange(len(episodes.u)), [-stored["num_val"]])
+    # half of the held-out episodes choose the weights, the other half is for the report
+    train, choose, report_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers}
@@ -437,16 +465,20 @@ def main(args: Args) -> None:
         frames = np.array(rgb[: len(train)][:128, ::8], np.float32)  # a sample that fits into memory
         history.image_mean = torch.from_numpy(frames.mean((0, 1)))
         history.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
+    if args.history_joints:
+        joints = np.load(episodes.dataset / "joints.npy", mmap_mode="r")[: len(train)]
+        history.joints_mean = torch.from_numpy(joints.mean((0, 1)))
+        history.joints_std = torch.from_numpy(joints.std((0, 1)).clip(0.05))  # the floor is stage 1's
     ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX: glibc keeps large tensors instead of asking for them anew,
     ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: an update is a third faster on a CPU
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
-    first, best_nll, best = 0, math.inf, None
+    first, best_error, best = 0, math.inf, None
     if (path / "checkpoint.pt").exists():
         checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first, best_nll, best = checkpoint["update"], checkpoint["best_nll"], checkpoint["best"]
+        first, best_error, best = checkpoint["update"], checkpoint["best_error"], checkpoint["best"]
         print(f"going on with {path} at update {first}", flush=True)
     writer = SummaryWriter(path, purge_step=first + 1)
     bar = tqdm(total=args.num_updates, initial=first, desc="belief", unit="update")
@@ -466,26 +498,29 @@ def main(args: Args) -> None:
                 writer.add_scalar(f"belief/{name}", value, update)
 
         if update % args.held_out_every == 0 or update == args.num_updates:
-            held_out = encode(model["belief"], model["posterior"], episodes, val)
-            nll = held_out["nll_prior"].mean().item()
-            writer.add_scalar("belief/held_out_nll_prior", nll, update)
+            held_out = encode(model["belief"], model["posterior"], episodes, choose)
+            error = (held_out["u"] - held_out["particle"]).square().sum(-1).mean().item()
+            writer.add_scalar("belief/held_out_error", error, update)
+            writer.add_scalar("belief/held_out_nll_prior", held_out["nll_prior"].mean(), update)
             writer.add_scalar("belief/held_out_nll_posterior", held_out["nll_posterior"].mean(), update)
-            bar.set_postfix(held_out_nll=f"{nll:.2f}")
-            if nll < best_nll:
-                best_nll, best = nll, copy.deepcopy(model.state_dict())
+            bar.set_postfix(held_out_error=f"{error:.3f}")
+            if error < best_error:  # of the mean particle, which is what PPO gets
+                best_error, best = error, copy.deepcopy(model.state_dict())
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            checkpoint |= {"best_nll": best_nll, "best": best}
+            checkpoint |= {"best_error": best_error, "best": best}
             save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
     model.load_state_dict(best)
-    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (train[:512], val))
+    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (choose, report_on))
     report = diagnose_belief(fit, test)
     cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)
     known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
     if args.action_head == "flow":
-        report["flow_gain"] = flow_gain(model["head"], test["q"], test["action"])
+        report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["q"], test["action"])
+        sampled = flow_gain(model["head"], test["z"], test["action"])
+        report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     save(path / "diagnostics.png", plot_diagnostics(report, f"{args.env_id}, {args.exp_name}"))
     content = {"kind": "aib_belief", **asdict(args), "config": config, "known": known}
@@ -502,13 +537,14 @@ def fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
-def parse_args(tasks: dict[str, dict], quick: dict) -> Args:
-    """Read the command line; defaults follow --env-id (tasks) and --quick, so that --help shows what will run."""
+def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
+    """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--env-id", "--env_id", default=Args.env_id)
+    early.add_argument("--small", action="store_true")
     early.add_argument("--quick", action="store_true")
     chosen, _ = early.parse_known_args()
-    settings = tasks.get(chosen.env_id, {}) | (quick if chosen.quick else {})
+    settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
@@ -567,9 +603,11 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 
 
 def run_stage(script: str, args: Args) -> None:
-    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and --quick."""
-    command = [sys.executable, str(Path(__file__).with_name(script))] + ["--quick"] * args.quick
-    for name in ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers"):
+    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
+    command = [sys.executable, str(Path(__file__).with_name(script))]
+    command += ["--small"] * args.small + ["--quick"] * args.quick
+    same = ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers")
+    for name in (*same, "num_episodes"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
     # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it
@@ -583,6 +621,6 @@ def run_stage(script: str, args: Args) -> None:
 
 if __name__ == "__main__":
     try:
-        main(parse_args({}, QUICK))
+        main(parse_args({}, SMALL, QUICK))
     except KeyboardInterrupt:
         sys.exit("\nstopped; the same command goes on from the last checkpoint")

@@ -41,9 +41,10 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 2  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported() if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
 # ---------------------------------------------------------------- arguments
@@ -69,8 +70,10 @@ class Args:
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; any number gives the same results"""
+    small: bool = False
+    """smaller than the paper, for a few CPU cores and hours; found on RememberColor3-v0"""
     quick: bool = False
-    """a trial of a few minutes whose results mean nothing"""
+    """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
     """delete what the run directory holds and start anew"""
 
@@ -78,7 +81,7 @@ class Args:
     """scenes simulated at a time on physx_cuda, which draws one arm pose for all of them"""
     num_episodes: int = 1000
     """episodes of the random policy"""
-    val_share: float = 0.05
+    val_share: float = 0.1
     """share of the episodes held out"""
     epochs: int = 200
     """passes over the training transitions"""
@@ -104,7 +107,8 @@ class Args:
     """convolutions in bfloat16"""
 
 
-QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_share=0.25, epochs=2)
+SMALL = dict(exp_name="aib_repr_small", num_episodes=640, epochs=7, batch_size=100, learning_rate=1e-3)
+QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_share=0.5, epochs=2)
 
 
 # ---------------------------------------------------------------- networks
@@ -278,8 +282,13 @@ def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> 
 
 
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test."""
+    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
+
+    The ridge is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    """
     varies = y.amax(0) > y.amin(0)
+    if not varies.any():
+        return math.nan
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
     classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
     model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
@@ -304,8 +313,8 @@ def diagnose_repr(phi: StateEncoder, state: torch.Tensor, cue: torch.Tensor, num
 def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
     num_val = round(args.num_episodes * args.val_share)
-    if not 0 < num_val < args.num_episodes:
-        fail(f"--val-share {args.val_share} of {args.num_episodes} leaves no episode held out or to train on; try 0.05")
+    if not 2 <= num_val < args.num_episodes:
+        fail(f"--val-share {args.val_share} of {args.num_episodes} holds out fewer than two episodes, or all; try 0.1")
     check_task(args)
     path, device = open_run(args), torch.device(args.device)
     if (path / "repr.pt").exists():
@@ -516,13 +525,14 @@ def fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
-def parse_args(tasks: dict[str, dict], quick: dict) -> Args:
-    """Read the command line; defaults follow --env-id (tasks) and --quick, so that --help shows what will run."""
+def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
+    """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--env-id", "--env_id", default=Args.env_id)
+    early.add_argument("--small", action="store_true")
     early.add_argument("--quick", action="store_true")
     chosen, _ = early.parse_known_args()
-    settings = tasks.get(chosen.env_id, {}) | (quick if chosen.quick else {})
+    settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
@@ -582,6 +592,6 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 
 if __name__ == "__main__":
     try:
-        main(parse_args({}, QUICK))
+        main(parse_args({}, SMALL, QUICK))
     except KeyboardInterrupt:
         sys.exit("\nstopped; the same command goes on from the last checkpoint")

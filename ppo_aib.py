@@ -13,6 +13,7 @@ import argparse
 import ctypes
 import fcntl
 import json
+import math
 import multiprocessing
 import os
 import shlex
@@ -38,6 +39,7 @@ import numpy as np
 import sapien
 import torch
 import torch.nn as nn
+import torch.utils.checkpoint
 import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
@@ -47,9 +49,11 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 2  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FRAMES = 2048  # images through a belief's CNN at a time: their activations take some 2 GB
 CUDA = torch.cuda.is_available()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
+torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
 # ---------------------------------------------------------------- arguments
@@ -75,13 +79,17 @@ class Args:
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; any number gives the same results"""
+    small: bool = False
+    """smaller than the paper, for a few CPU cores and hours; found on RememberColor3-v0"""
     quick: bool = False
-    """a trial of a few minutes whose results mean nothing"""
+    """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
     """delete what the run directory holds and start anew"""
 
     belief: str = "runs/{env_id}__aib_belief__{seed}/belief.pt"
     """belief of stage 2"""
+    num_episodes: int = 1000
+    """episodes of the random policy, where stage 1 has still to collect them"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
     particle_noise: bool = True
@@ -126,7 +134,11 @@ TASKS = {  # Table 5, where it differs from the defaults above, which are Interc
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
-QUICK = dict(exp_name="ppo_aib_quick", total_timesteps=360, num_envs=2, num_eval_episodes=2)
+SMALL = dict(exp_name="ppo_aib_small", total_timesteps=200_000, num_envs=16, learning_rate=3e-4, gamma=0.95)
+SMALL |= dict(update_epochs=4, num_minibatches=8, eval_every=20, num_eval_episodes=64)
+SMALL["belief"] = "runs/{env_id}__aib_belief_small__{seed}/belief.pt"
+SMALL["num_episodes"] = 640
+QUICK = dict(exp_name="ppo_aib_quick", num_episodes=8, total_timesteps=360, num_envs=2, num_eval_episodes=2)
 QUICK["belief"] = "runs/{env_id}__aib_belief_quick__{seed}/belief.pt"
 
 
@@ -184,6 +196,8 @@ class HistoryEncoder(nn.Module):
         super().__init__()
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
+        self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
+        self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
         # beside the image, joints and previous actions, where their sizes are not 0
         self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
         inputs = 512 + config["joints_dim"] + config["action_dim"]
@@ -191,18 +205,25 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
 
+    def embed(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Images (B, H, W, 3) uint8 -> features (B, 512)."""
+        return self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+
     def forward(
         self, batch: dict[str, torch.Tensor], memory: torch.Tensor | None = None, bptt_steps: int | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Encode T steps of B histories that go on from memory, the GRU's state: -> h (T, B, 256), memory.
 
         batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J), previous (T, B, A), the action before each observation.
-        All T * B frames go through the CNN in one call; T = 1 is the step path of PPO.
+        All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in
+        chunks that the backward pass computes once more. T = 1 is the step path of PPO.
         """
-        images = batch["rgb"].flatten(0, 1).float().sub_(self.image_mean).div_(self.image_std)
-        x = self.cnn(images).view(*batch["rgb"].shape[:2], -1)
+        chunks = batch["rgb"].flatten(0, 1).split(FRAMES)
+        again = partial(torch.utils.checkpoint.checkpoint, self.embed, use_reentrant=False)
+        x = torch.cat([again(chunk) for chunk in chunks]) if len(chunks) > 1 else self.embed(chunks[0])
+        x = x.view(*batch["rgb"].shape[:2], -1)
         if self.use_joints:
-            x = torch.cat([x, batch["joints"]], -1)
+            x = torch.cat([x, (batch["joints"] - self.joints_mean) / self.joints_std], -1)
         if self.use_actions:
             x = torch.cat([x, batch["previous"]], -1)
         outputs = []
@@ -236,13 +257,12 @@ class BeliefAgent(nn.Module):
         super().__init__()
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(belief.config["image_shape"], 256, amp))
-        self.joints = orthogonal_init(nn.Linear(joints_dim, 128))
+        self.joints = orthogonal_init(nn.Sequential(nn.Linear(joints_dim, 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
         self.w_agg = orthogonal_init(mlp([64, 64, 64]))
         self.actor = orthogonal_init(mlp([256 + 128 + 64, 512, action_dim]))
         self.critic = orthogonal_init(mlp([256 + 128 + 64, 512, 1]))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
-        orthogonal_init(self.critic[-1], 1.0)
         self.log_std = nn.Parameter(torch.full((action_dim,), -0.5))
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
@@ -367,8 +387,13 @@ def make_video(data: dict[str, torch.Tensor]) -> bytes:
 
 
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test."""
+    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
+
+    The ridge is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    """
     varies = y.amax(0) > y.amin(0)
+    if not varies.any():
+        return math.nan
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
     classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
     model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
@@ -408,7 +433,7 @@ def main(args: Args) -> None:
         return
     if not args.evaluate:
         file = Path(args.belief.format(**vars(args)))
-        if not file.exists() and args.belief in (Args.belief, QUICK["belief"]):
+        if not file.exists() and args.belief in (Args.belief, SMALL["belief"], QUICK["belief"]):
             run_stage("aib_belief.py", args)
         hint = f"make it anew with aib_belief.py --env-id {args.env_id} --seed {args.seed} --overwrite"
         task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
@@ -638,13 +663,14 @@ def fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
-def parse_args(tasks: dict[str, dict], quick: dict) -> Args:
-    """Read the command line; defaults follow --env-id (tasks) and --quick, so that --help shows what will run."""
+def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
+    """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--env-id", "--env_id", default=Args.env_id)
+    early.add_argument("--small", action="store_true")
     early.add_argument("--quick", action="store_true")
     chosen, _ = early.parse_known_args()
-    settings = tasks.get(chosen.env_id, {}) | (quick if chosen.quick else {})
+    settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
@@ -703,9 +729,11 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 
 
 def run_stage(script: str, args: Args) -> None:
-    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and --quick."""
-    command = [sys.executable, str(Path(__file__).with_name(script))] + ["--quick"] * args.quick
-    for name in ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers"):
+    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
+    command = [sys.executable, str(Path(__file__).with_name(script))]
+    command += ["--small"] * args.small + ["--quick"] * args.quick
+    same = ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers")
+    for name in (*same, "num_episodes"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
     # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it
@@ -719,6 +747,6 @@ def run_stage(script: str, args: Args) -> None:
 
 if __name__ == "__main__":
     try:
-        main(parse_args(TASKS, QUICK))
+        main(parse_args(TASKS, SMALL, QUICK))
     except KeyboardInterrupt:
         sys.exit("\nstopped; the same command goes on from the last checkpoint")

@@ -44,6 +44,7 @@ import numpy as np
 import sapien
 import torch
 import torch.nn as nn
+import torch.utils.checkpoint
 import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
@@ -53,10 +54,12 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 2  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FRAMES = 2048  # images through a belief's CNN at a time: their activations take some 2 GB
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported() if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
+torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
 # ---------------------------------------------------------------- arguments
@@ -82,13 +85,17 @@ class Args:
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; any number gives the same results"""
+    small: bool = False
+    """smaller than the paper, for a few CPU cores and hours; found on RememberColor3-v0"""
     quick: bool = False
-    """a trial of a few minutes whose results mean nothing"""
+    """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
     """delete what the run directory holds and start anew"""
 
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
+    num_episodes: int = 1000
+    """episodes of the random policy, where stage 1 has still to collect them"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper calls them epochs"""
     batch_episodes: int = 256
@@ -107,8 +114,8 @@ class Args:
     """GRU gates that start out remembering for up to an episode (Tallec and Ollivier, 2018)"""
     gru_layers: int = 1
     """layers of the GRU"""
-    history_joints: bool = False
-    """joints in the history"""
+    history_joints: bool = True
+    """joints in the history, as in the paper; its authors' code has the image alone"""
     history_actions: bool = False
     """previous actions in the history; then z can carry them with no regard for the world"""
     belief_amp: bool = BFLOAT16
@@ -160,8 +167,12 @@ TASKS = {  # Table 5, where it differs from the defaults above, which are Interc
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
+SMALL = dict(exp_name="ppo_believer_small", total_timesteps=200_000, num_envs=16, learning_rate=3e-4, gamma=0.95)
+SMALL |= dict(update_epochs=4, num_minibatches=8, eval_every=20, num_eval_episodes=64)
+SMALL |= dict(num_episodes=640, num_updates=300, batch_episodes=16, belief_lr=1e-3)
+SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
 QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_eval_episodes=2)
-QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_updates=4, batch_episodes=4)
+QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_episodes=8, num_updates=4, batch_episodes=4)
 
 
 # ---------------------------------------------------------------- networks
@@ -231,6 +242,8 @@ class HistoryEncoder(nn.Module):
         super().__init__()
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
+        self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
+        self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
         # beside the image, joints and previous actions, where their sizes are not 0
         self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
         inputs = 512 + config["joints_dim"] + config["action_dim"]
@@ -238,18 +251,25 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
 
+    def embed(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Images (B, H, W, 3) uint8 -> features (B, 512)."""
+        return self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+
     def forward(
         self, batch: dict[str, torch.Tensor], memory: torch.Tensor | None = None, bptt_steps: int | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Encode T steps of B histories that go on from memory, the GRU's state: -> h (T, B, 256), memory.
 
         batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J), previous (T, B, A), the action before each observation.
-        All T * B frames go through the CNN in one call; T = 1 is the step path of PPO.
+        All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in
+        chunks that the backward pass computes once more. T = 1 is the step path of PPO.
         """
-        images = batch["rgb"].flatten(0, 1).float().sub_(self.image_mean).div_(self.image_std)
-        x = self.cnn(images).view(*batch["rgb"].shape[:2], -1)
+        chunks = batch["rgb"].flatten(0, 1).split(FRAMES)
+        again = partial(torch.utils.checkpoint.checkpoint, self.embed, use_reentrant=False)
+        x = torch.cat([again(chunk) for chunk in chunks]) if len(chunks) > 1 else self.embed(chunks[0])
+        x = x.view(*batch["rgb"].shape[:2], -1)
         if self.use_joints:
-            x = torch.cat([x, batch["joints"]], -1)
+            x = torch.cat([x, (batch["joints"] - self.joints_mean) / self.joints_std], -1)
         if self.use_actions:
             x = torch.cat([x, batch["previous"]], -1)
         outputs = []
@@ -294,13 +314,12 @@ class BeliefAgent(nn.Module):
         super().__init__()
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(belief.config["image_shape"], 256, amp))
-        self.joints = orthogonal_init(nn.Linear(joints_dim, 128))
+        self.joints = orthogonal_init(nn.Sequential(nn.Linear(joints_dim, 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
         self.w_agg = orthogonal_init(mlp([64, 64, 64]))
         self.actor = orthogonal_init(mlp([256 + 128 + 64, 512, action_dim]))
         self.critic = orthogonal_init(mlp([256 + 128 + 64, 512, 1]))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
-        orthogonal_init(self.critic[-1], 1.0)
         self.log_std = nn.Parameter(torch.full((action_dim,), -0.5))
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
@@ -400,7 +419,7 @@ class Episodes:
 def load_episodes(args: Args) -> tuple[Episodes, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, QUICK["repr_dir"]):
+    if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"]):
         run_stage("aib_repr.py", args)
     hint = f"make it anew with aib_repr.py --env-id {args.env_id} --seed {args.seed} --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
@@ -465,8 +484,13 @@ def rollout_with_belief(
 
 
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test."""
+    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
+
+    The ridge is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    """
     varies = y.amax(0) > y.amin(0)
+    if not varies.any():
+        return math.nan
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
     classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
     model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
@@ -478,7 +502,7 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
 def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: np.ndarray) -> dict[str, torch.Tensor]:
     """What the belief makes of episodes index (E,), each (E, T+1, .): h, u, action (E, T, A), cue (E, K), and
 
-    particle: the mean of 30 decoded prior samples; q: the posterior's mean; posterior: its decoding;
+    particle: the mean of 30 decoded prior samples; z, q: a sample and the mean of the posterior; posterior: q decoded;
     nll_prior: -log p(u|h) (E, T+1), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows
     of three possible places is right about each; nll_posterior: -log p(u|z,h) under one z of the posterior.
     """
@@ -487,10 +511,10 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
         u, (h, _) = batch["u"], belief.history(batch)
-        nll, _, _, mean = elbo_terms(belief, posterior, u, h)
+        nll, _, z, mean = elbo_terms(belief, posterior, u, h)
         decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
-        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "q": mean, "nll_posterior": nll}
+        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "q": mean, "nll_posterior": nll}
         part["nll_prior"] = math.log(30) - log_p.logsumexp(-1)
         part["posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
         part = {name: x.transpose(0, 1) for name, x in {**part, "action": batch["actions"]}.items()}
@@ -499,7 +523,11 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
 
 
 def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) -> dict:
-    """What the belief remembers, lists by time step; fit and test: encode's of training and held-out episodes."""
+    """What the belief remembers, lists by time step.
+
+    fit and test are encode's of two sets of episodes that the belief was not trained on: read-outs are fitted on the
+    first and everything is measured on the second.
+    """
     nll, nll_posterior = test["nll_prior"].mean().item(), test["nll_posterior"].mean().item()
     report = {"nll_prior": nll, "nll_posterior": nll_posterior, "prior_gap": nll - nll_posterior}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
@@ -575,7 +603,8 @@ def train_belief(args: Args, path: Path) -> None:
     """Train Believer's belief on stage 1's output as aib_belief.py does; writes belief.pt and diagnostics into path."""
     device = torch.device(args.device)
     episodes, stored = load_episodes(args)
-    train, val = np.split(np.arange(len(episodes.u)), [-stored["num_val"]])
+    # half of the held-out episodes choose the weights, the other half is for the report
+    train, choose, report_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers}
@@ -592,16 +621,20 @@ def train_belief(args: Args, path: Path) -> None:
         frames = np.array(rgb[: len(train)][:128, ::8], np.float32)  # a sample that fits into memory
         history.image_mean = torch.from_numpy(frames.mean((0, 1)))
         history.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
+    if args.history_joints:
+        joints = np.load(episodes.dataset / "joints.npy", mmap_mode="r")[: len(train)]
+        history.joints_mean = torch.from_numpy(joints.mean((0, 1)))
+        history.joints_std = torch.from_numpy(joints.std((0, 1)).clip(0.05))  # the floor is stage 1's
     ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX: glibc keeps large tensors instead of asking for them anew,
     ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: an update is a third faster on a CPU
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
-    first, best_nll, best = 0, math.inf, None
+    first, best_error, best = 0, math.inf, None
     if (path / "belief_checkpoint.pt").exists():
         checkpoint = load(path / "belief_checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first, best_nll, best = checkpoint["update"], checkpoint["best_nll"], checkpoint["best"]
+        first, best_error, best = checkpoint["update"], checkpoint["best_error"], checkpoint["best"]
         print(f"going on with {path} at update {first}", flush=True)
     writer = SummaryWriter(path / "belief_events", purge_step=first + 1)
     bar = tqdm(total=args.num_updates, initial=first, desc="belief", unit="update")
@@ -621,21 +654,22 @@ def train_belief(args: Args, path: Path) -> None:
                 writer.add_scalar(f"belief/{name}", value, update)
 
         if update % args.held_out_every == 0 or update == args.num_updates:
-            held_out = encode(model["belief"], model["posterior"], episodes, val)
-            nll = held_out["nll_prior"].mean().item()
-            writer.add_scalar("belief/held_out_nll_prior", nll, update)
+            held_out = encode(model["belief"], model["posterior"], episodes, choose)
+            error = (held_out["u"] - held_out["particle"]).square().sum(-1).mean().item()
+            writer.add_scalar("belief/held_out_error", error, update)
+            writer.add_scalar("belief/held_out_nll_prior", held_out["nll_prior"].mean(), update)
             writer.add_scalar("belief/held_out_nll_posterior", held_out["nll_posterior"].mean(), update)
-            bar.set_postfix(held_out_nll=f"{nll:.2f}")
-            if nll < best_nll:
-                best_nll, best = nll, copy.deepcopy(model.state_dict())
+            bar.set_postfix(held_out_error=f"{error:.3f}")
+            if error < best_error:  # of the mean particle, which is what PPO gets
+                best_error, best = error, copy.deepcopy(model.state_dict())
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            checkpoint |= {"best_nll": best_nll, "best": best}
+            checkpoint |= {"best_error": best_error, "best": best}
             save(path / "belief_checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
     model.load_state_dict(best)
-    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (train[:512], val))
+    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (choose, report_on))
     report = diagnose_belief(fit, test)
     cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)
     known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
@@ -663,6 +697,7 @@ def main(args: Args) -> None:
     if not args.evaluate:
         if not (path / "belief.pt").exists():
             train_belief(args, path)
+            torch.cuda.empty_cache()  # the simulator needs the GPU's memory too
         stored = load(path / "belief.pt", "start anew with --overwrite", kind="believer_belief")
 
     envs, device = make_envs(args), torch.device(args.device)
@@ -889,13 +924,14 @@ def fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
-def parse_args(tasks: dict[str, dict], quick: dict) -> Args:
-    """Read the command line; defaults follow --env-id (tasks) and --quick, so that --help shows what will run."""
+def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
+    """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--env-id", "--env_id", default=Args.env_id)
+    early.add_argument("--small", action="store_true")
     early.add_argument("--quick", action="store_true")
     chosen, _ = early.parse_known_args()
-    settings = tasks.get(chosen.env_id, {}) | (quick if chosen.quick else {})
+    settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
@@ -954,9 +990,11 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 
 
 def run_stage(script: str, args: Args) -> None:
-    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and --quick."""
-    command = [sys.executable, str(Path(__file__).with_name(script))] + ["--quick"] * args.quick
-    for name in ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers"):
+    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
+    command = [sys.executable, str(Path(__file__).with_name(script))]
+    command += ["--small"] * args.small + ["--quick"] * args.quick
+    same = ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers")
+    for name in (*same, "num_episodes"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
     # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it
@@ -970,6 +1008,6 @@ def run_stage(script: str, args: Args) -> None:
 
 if __name__ == "__main__":
     try:
-        main(parse_args(TASKS, QUICK))
+        main(parse_args(TASKS, SMALL, QUICK))
     except KeyboardInterrupt:
         sys.exit("\nstopped; the same command goes on from the last checkpoint")

@@ -37,7 +37,7 @@ ROWS = {
 }
 BELIEVER = """
 import ppo_believer as b
-args = b.parse_args({}, {})
+args = b.parse_args({}, {}, {})
 path = b.open_run(args)
 if not (path / "belief.pt").exists():
     b.train_belief(args, path)

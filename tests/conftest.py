@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import torch
 
 import aib_belief
 import aib_repr
@@ -19,6 +20,16 @@ ROOT = Path(__file__).parent.parent
 SCRIPTS = {module.__name__: module for module in (aib_repr, aib_belief, ppo_aib, ppo_believer, ppo_baseline)}
 TASK, TOY = "RememberColor9-v0", "ToyMemory-v0"
 os.environ["TQDM_MININTERVAL"] = "30"
+if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each process
+    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Where tests run in several processes, those that share a slow fixture go to the same one."""
+    for item in items:
+        for fixture in {"quick_runs", "reference"}.intersection(item.fixturenames):
+            item.add_marker(pytest.mark.xdist_group(fixture))
 
 
 def run(script: str, *arguments: str, cwd: Path, env: dict | None = None, timeout: float = 600) -> tuple[int, str, str]:
@@ -47,7 +58,7 @@ def toy_stages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         toy.take_the_simulators_place(patch.setattr, aib_repr)
-        aib_repr.main(aib_repr.Args(env_id=TOY, num_episodes=20, epochs=1, batch_size=50))
+        aib_repr.main(aib_repr.Args(env_id=TOY, num_episodes=20, val_share=0.25, epochs=1, batch_size=50))
         aib_belief.main(aib_belief.Args(env_id=TOY, num_updates=3, batch_episodes=4))
     return folder / "runs"
 

@@ -76,7 +76,7 @@ def test_numbers_and_devices(
         pytest.skip("there is a CUDA device")
     monkeypatch.setattr(sys, "argv", [script, *arguments])
     with pytest.raises(SystemExit) as stop:
-        SCRIPTS[script].parse_args({}, {})
+        SCRIPTS[script].parse_args({}, {}, {})
     refused((stop.value.code, *capsys.readouterr()), *words)
 
 
@@ -108,14 +108,14 @@ def change(path: Path, **values: object) -> Callable[[], object]:
 
 
 def code_in(path: Path) -> Callable[[], object]:
-    return lambda: torch.save({"format": 2, "kind": "aib_belief", "x": Payload()}, path)
+    return lambda: torch.save({"format": aib_repr.FORMAT, "kind": "aib_belief", "x": Payload()}, path)
 
 
 STAGE_2 = dict(exp_name="again", num_updates=1)
 PPO = dict(num_envs=4, total_timesteps=40, num_eval_episodes=4, num_minibatches=2)
 ONLY_EVALUATE = dict(evaluate=True, num_envs=4, num_eval_episodes=4, checkpoint=str(AGENT))
 CASES = {  # name: (script, arguments, damage, words of the sentence)
-    "nothing held out": (aib_repr, dict(val_share=0.0), None, ["--val-share 0.0", "try 0.05"]),
+    "nothing held out": (aib_repr, dict(val_share=0.0), None, ["--val-share 0.0", "try 0.1"]),
     "all held out": (aib_repr, dict(val_share=1.0), None, ["--val-share 1.0"]),
     "no disk for it": (aib_repr, dict(exp_name="big", num_episodes=10**10), None, ["has free", "--num-episodes"]),
     "repr.pt cut short": (aib_belief, STAGE_2, cut(REPR_PT), ["repr.pt is missing, damaged", "--overwrite"]),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import aib_belief
 import ppo_aib
 import ppo_baseline
 import ppo_believer
@@ -144,7 +145,7 @@ def test_any_number_of_workers_gives_the_same_training_and_evaluation(
 
 def test_orthogonal_initialisation() -> None:
     agent = ppo_baseline.Agent([36, 36, 3], 3, 2)
-    for layer, gain in ((agent.joints, 2**0.5), (agent.actor[2], 0.01 * 2**0.5), (agent.critic[2], 1.0)):
+    for layer, gain in ((agent.joints[0], 2**0.5), (agent.actor[2], 0.01 * 2**0.5), (agent.critic[2], 2**0.5)):
         gram = layer.weight @ layer.weight.T if layer.weight.shape[0] <= layer.weight.shape[1] else None
         gram = layer.weight.T @ layer.weight if gram is None else gram
         assert torch.allclose(gram, gain**2 * torch.eye(len(gram)), atol=1e-4) and (layer.bias == 0).all()
@@ -158,13 +159,21 @@ def test_table_5(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
     tasks |= {"InterceptMedium-v0": (10_000_000, 256, 2, 0.99), "InterceptFast-v0": (10_000_000, 256, 2, 0.99)}
     for task, values in tasks.items():
         monkeypatch.setattr(sys, "argv", ["script", "--env-id", task])
-        args = module.parse_args(module.TASKS, module.QUICK)
+        args = module.parse_args(module.TASKS, module.SMALL, module.QUICK)
         assert (args.env_id, args.total_timesteps, args.num_envs, args.update_epochs, args.gamma) == (task, *values)
         common = (args.learning_rate, args.gae_lambda, args.ent_coef, args.target_kl, args.num_minibatches)
         assert common == (1e-4, 0.9, 0.001, 0.05, 32)
     monkeypatch.setattr(sys, "argv", ["script", "--quick", "--env-id=RememberColor9-v0", "--gamma", "0.5"])
-    args = module.parse_args(module.TASKS, module.QUICK)
+    args = module.parse_args(module.TASKS, module.SMALL, module.QUICK)
     assert (args.num_envs, args.gamma, args.quick, args.exp_name) == (2, 0.5, True, f"{script}_quick")
+
+
+def test_small_settings_are_the_same_for_all_three_methods() -> None:
+    own = {"exp_name", "belief", "repr_dir", "num_episodes", "num_updates", "batch_episodes", "belief_lr"}
+    first, *others = ({name: x for name, x in SCRIPTS[s].SMALL.items() if name not in own} for s in METHODS)
+    assert first["total_timesteps"] >= 200_000 and all(first == other for other in others)
+    stage_2 = {name: x for name, x in aib_belief.SMALL.items() if name != "exp_name"}
+    assert stage_2.items() <= ppo_believer.SMALL.items(), "Believer's belief is trained as AIB's"
 
 
 def test_help_shows_what_will_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
@@ -172,7 +181,7 @@ def test_help_shows_what_will_run(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     for module in SCRIPTS.values():
         monkeypatch.setattr(sys, "argv", ["script", "--help", "--env-id", "RememberColor9-v0"])
         with pytest.raises(SystemExit):
-            module.parse_args(getattr(module, "TASKS", {}), module.QUICK)
+            module.parse_args(getattr(module, "TASKS", {}), module.SMALL, module.QUICK)
         shown = capsys.readouterr().out
         assert shown.count("default: None") == ("bptt" in shown), "only where nothing is the value"
         assert "10380000" in shown or not hasattr(module, "TASKS")
