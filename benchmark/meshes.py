@@ -1,7 +1,7 @@
 """Does a belief trained on light pictures read the cue from stock pictures, and how well from its own?
 
-Trains stage 1 and the belief on decimated meshes, then collects held-out episodes of another seed twice, with light and
-with untouched meshes, and fits the cue's read-out on light training episodes only. Runs are kept in runs/*meshes*.
+Takes the belief of `aib_belief.py --small`, made first where it is missing, then collects episodes of another seed twice,
+with light and with untouched meshes, and fits the cue's read-out on the light episodes that the belief was not trained on.
 
 Usage:   python benchmark/meshes.py
 """
@@ -26,10 +26,6 @@ import aib_belief  # noqa: E402
 class Args:
     env_id: str = "RememberColor3-v0"
     """MIKASA-Robo task"""
-    num_episodes: int = 320
-    """light episodes to train on"""
-    num_updates: int = 240
-    """of stage 2, of 16 episodes"""
     num_test: int = 64
     """episodes of either kind to test on"""
 
@@ -43,18 +39,14 @@ def run(*command: str) -> None:
 
 def main(args: Args) -> None:
     """Run what is missing and print the read-outs."""
-    task = ["--env-id", args.env_id]
-    stage1 = ["--batch-size", "100", "--learning-rate", "1e-3", "--exp-name", "meshes_repr", "--val-share", "0.1"]
-    run("aib_repr.py", *task, *stage1, "--num-episodes", str(args.num_episodes), "--epochs", "13")
-    runs = Path("runs")
-    repr_dir = runs / f"{args.env_id}__meshes_repr__1"
-    stage2 = ["--num-updates", str(args.num_updates), "--batch-episodes", "16", "--belief-lr", "1e-3"]
-    run("aib_belief.py", *task, *stage2, "--exp-name", "meshes_belief", "--repr-dir", str(repr_dir))
+    task, runs = ["--env-id", args.env_id], Path("runs")
+    run("aib_belief.py", *task, "--small", "--mesh-triangles", "500")
+    repr_dir = runs / f"{args.env_id}__aib_repr_small__1"
     for triangles in (500, 0):
         test = ["--num-episodes", str(args.num_test), "--epochs", "1", "--seed", "2", "--val-share", "0.5"]
         run("aib_repr.py", *task, *test, "--mesh-triangles", str(triangles), "--exp-name", f"meshes_test_{triangles}")
 
-    stored = torch.load(runs / f"{args.env_id}__meshes_belief__1" / "belief.pt", weights_only=True)
+    stored = torch.load(runs / f"{args.env_id}__aib_belief_small__1" / "belief.pt", weights_only=True)
     stored_repr = torch.load(repr_dir / "repr.pt", weights_only=True)
     phi = aib_belief.StateEncoder(len(stored_repr["phi"]["mean"]), stored_repr["u_dim"])
     phi.load_state_dict(stored_repr["phi"])
@@ -63,12 +55,13 @@ def main(args: Args) -> None:
     model.load_state_dict({name: x for name, x in stored["training"].items() if not name.startswith("head")})
 
     def encode(path: Path, count: int) -> dict[str, torch.Tensor]:
+        """aib_belief.encode of the last episodes of a dataset."""
         state, cue = (torch.from_numpy(np.load(path / "dataset" / f"{name}.npy")) for name in ("state", "cue"))
         with torch.no_grad():
             episodes = aib_belief.Episodes(path / "dataset", phi(state).mean, cue, torch.device("cpu"))
-        return aib_belief.encode(model["belief"], model["posterior"], episodes, np.arange(count))
+        return aib_belief.encode(model["belief"], model["posterior"], episodes, np.arange(len(state))[-count:])
 
-    fit = encode(repr_dir, args.num_episodes)
+    fit = encode(repr_dir, stored_repr["num_val"])
     report = {}
     for name, triangles in (("light", 500), ("stock", 0)):
         test = encode(runs / f"{args.env_id}__meshes_test_{triangles}__2", args.num_test)
