@@ -1,7 +1,7 @@
 """Does a belief trained on light pictures read the cue from stock pictures, and how well from its own?
 
-Takes the belief of `aib_belief.py --small`, made first where it is missing, then collects episodes of another seed twice,
-with light and with untouched meshes, and fits the cue's read-out on the light episodes that the belief was not trained on.
+Takes the belief of `aib_belief.py --small`, made first where it is missing, collects episodes of another seed twice,
+with light and with untouched meshes, and fits the cue's read-out on light episodes the belief was not trained on.
 
 Usage:   python benchmark/meshes.py
 """
