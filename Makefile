@@ -1,4 +1,5 @@
 # make run: set everything up, then train AIB on InterceptFast (a --quick trial where there is no CUDA device)
+# make demo: set everything up, then train AIB on RememberColor3 with --small, for hours, and draw its curve
 # make test: set everything up, then lint and run the tests
 # make test-all: the same with every kill of every stage and three seeds of the learning test
 # make bench: speed and memory, as ratios measured in one run
@@ -7,7 +8,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .ONESHELL:
 .SILENT:
-.PHONY: run test test-all bench bench-belief setup vulkan
+.PHONY: run demo test test-all bench bench-belief setup vulkan
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -15,6 +16,12 @@ PY := .venv/bin/python
 run: setup
 	quick=$$($(PY) -c "import torch; print('' if torch.cuda.is_available() else '--quick')")
 	$(PY) ppo_aib.py --env-id InterceptFast-v0 $$quick
+
+demo: setup
+	echo "AIB on RememberColor3-v0 with --small takes some 3 hours on two CPU cores; stopped, make demo goes on with it"
+	$(PY) ppo_aib.py --env-id RememberColor3-v0 --small
+	$(PY) benchmark/report.py --small
+	echo "curve: benchmark/report/small.png; videos: $$(ls -d runs/RememberColor3-v0__ppo_aib_small__1/videos)"
 
 test: setup
 	$(PY) -m ruff check .

@@ -1,9 +1,11 @@
 """Tables 1, 6, 7, 8 and Figures 2, 3, 4, 8 of the paper from finished runs, beside the paper's own numbers.
 
+With --small, one table and one figure of the three methods' --small runs, on whatever tasks there are.
+
 Usage:   python benchmark/report.py                 (reads runs/, writes benchmark/report/)
-         python benchmark/report.py --runs results --output report
+         python benchmark/report.py --small --runs benchmark/results --output benchmark/results   (the README's figure)
 Reads:   {runs}/{env_id}__{exp_name}__{seed}/ of the PPO scripts: args.json, eval.csv
-Writes:  {output}/report.md and PNG figures
+Writes:  {output}/report.md (small.md) and PNG figures
 """
 
 import csv
@@ -75,6 +77,8 @@ class Args:
     """folder of run directories"""
     output: Path = Path("benchmark/report")
     """folder for report.md and the figures"""
+    small: bool = False
+    """report the --small runs"""
 
 
 @dataclass
@@ -149,6 +153,24 @@ def main_table(runs: dict, key: tuple[str, str]) -> str:
     return "\n".join(lines)
 
 
+def small_report(runs: dict, output: Path) -> None:
+    """small.md and small.png: every task that any of the three methods was run on with --small."""
+    tasks = sorted({task for task, _ in runs})
+    lines = ["# Runs with --small", "", "| task | measure | " + " | ".join(METHODS.values()) + " |", "|" + "---|" * 5]
+    figure, axes = plt.subplots(1, len(tasks), figsize=(5 * len(tasks) + 1, 4), layout="constrained", squeeze=False)
+    for ax, task in zip(axes[0], tasks, strict=True):
+        for column, which in PAPER:
+            cells = [cell(runs.get((task, f"{name}_small")), column, which) for name in METHODS]
+            measure = f"{column}, {'mean of the last three' if which == 'last' else 'maximum'}"
+            lines.append(f"| {task} | {measure} | " + " | ".join(cells) + " |")
+        for method, label in METHODS.items():
+            draw(ax, runs.get((task, f"{method}_small")), "success_once", label, COLOURS[method])
+        ax.set_title(task)
+    finish(figure, axes[0], "success_once", output / "small.png")
+    (output / "small.md").write_text("\n".join(lines) + "\n\n![success_once](small.png)\n")
+    print(f"{output / 'small.md'}: {', '.join(tasks)}")
+
+
 def variant_table(runs: dict, title: str, variants: dict[str, str], paper: dict[str, str]) -> str:
     """An ablation on InterceptFast-v0: success_once, mean of the last three evaluations."""
     lines = [f"## {title}", "", "| variant | success_once | paper's |", "|---|---|---|"]
@@ -190,10 +212,15 @@ def finish(figure: plt.Figure, axes: np.ndarray, column: str, path: Path) -> Non
 def main(args: Args) -> None:
     """Write the report; fails with one sentence when there is no run to report on."""
     runs = read_runs(args.runs)
+    if args.small:
+        runs = {(task, name): found for (task, name), found in runs.items() if name.endswith("_small")}
     if not runs:
         print(f"error: no eval.csv below {args.runs}; name the folder of run directories with --runs", file=sys.stderr)
         sys.exit(2)
     args.output.mkdir(parents=True, exist_ok=True)
+    if args.small:
+        small_report(runs, args.output)
+        return
     for column, name in (("success_once", "figure_2.png"), ("success_at_end", "figure_8.png")):
         figure, axes = plt.subplots(1, 4, figsize=(18, 4), layout="constrained")
         for ax, (task, short) in zip(axes, TASKS.items(), strict=True):

@@ -1,6 +1,8 @@
 """The benchmark's commands and its report, on small recorded runs with numbers one can check by hand."""
 
+import json
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +41,21 @@ def test_tables_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     assert "| MSE regression | seed 1 is a --quick trial | only a figure |" in text
     for figure in ("figure_2.png", "figure_3.png", "figure_4.png", "figure_8.png"):
         assert iio.imread(tmp_path / figure).std() > 10
+
+
+def test_small_runs_of_any_task(tmp_path: Path) -> None:
+    for seed in (1, 2, 3):
+        run = tmp_path / f"X-v0__ppo_aib_small__{seed}"
+        shutil.copytree(RECORDED / f"RememberShapeAndColor3x2-v0__ppo_aib__{seed}", run)
+        args = json.loads((run / "args.json").read_text())
+        (run / "args.json").write_text(json.dumps({**args, "env_id": "X-v0", "exp_name": "ppo_aib_small"}))
+    report.main(report.Args(runs=tmp_path, output=tmp_path, small=True))
+    text = (tmp_path / "small.md").read_text()
+    values = "0.63 ± 0.15 (3 seeds), IQM 0.62 [0.50, 0.80]"
+    assert (
+        f"| X-v0 | success_once, mean of the last three | {values} | missing | missing |" in text
+        and iio.imread(tmp_path / "small.png").std() > 10
+    )
 
 
 def test_interquartile_mean() -> None:
