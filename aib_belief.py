@@ -5,8 +5,8 @@ tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) sh
 that shape to the prior, which is what the robot has when it acts.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
-         close to the published code: --image-norm none --no-chrono-init --bptt-steps 16, on stage 1 with
-         --no-reward-norm --kl-coef 0.03 --kl-reduction mean --image-norm none
+         close to the published code: --image-norm none --no-chrono-init --bptt-steps 16 --no-history-joints
+         --gru-layers 3, on stage 1 with --no-reward-norm --kl-coef 0.03 --kl-reduction mean
 Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where they are missing, aib_repr.py runs first
 Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, diagnostics.png, TensorBoard events
 """
@@ -117,7 +117,7 @@ class Args:
     """updates between looks at the held-out episodes; the best weights are kept"""
 
 
-SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=300, batch_episodes=16, belief_lr=1e-3)
+SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
 QUICK = dict(exp_name="aib_belief_quick", num_episodes=8, num_updates=4, batch_episodes=4)
 QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
@@ -280,7 +280,8 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Ar
     losses = {"nll": nll.mean(), "kl": kl.mean()}
     losses["total"] = losses["nll"] + args.beta * losses["kl"]
     if args.action_head != "none":
-        z, action = mean if args.fm_latent == "mean" else z, batch["actions"]
+        z = mean if args.fm_latent == "mean" else z
+        action = batch["actions"]
         if args.action_head == "flow":
             noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
             losses["action"] = flow_matching_loss(model["head"], action, z[:-1], z[1:], noise, tau).mean()
@@ -323,7 +324,7 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     path = Path(args.repr_dir.format(**vars(args)))
     if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"]):
         run_stage("aib_repr.py", args)
-    hint = f"make it anew with aib_repr.py --env-id {args.env_id} --seed {args.seed} --overwrite"
+    hint = "make it anew with aib_repr.py --overwrite, where --env-id, --seed, --small and --quick are the same as here"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
     try:
@@ -344,7 +345,7 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
     """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
 
-    The ridge is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
     """
     varies = y.amax(0) > y.amin(0)
     if not varies.any():
@@ -360,7 +361,7 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
 def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: np.ndarray) -> dict[str, torch.Tensor]:
     """What the belief makes of episodes index (E,), each (E, T+1, .): h, u, action (E, T, A), cue (E, K), and
 
-    particle: the mean of 30 decoded prior samples; z, q: a sample and the mean of the posterior; posterior: q decoded;
+    particle: the mean of 30 decoded prior samples; z, z_mean: the posterior's sample and mean; posterior: that decoded;
     nll_prior: -log p(u|h) (E, T+1), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows
     of three possible places is right about each; nll_posterior: -log p(u|z,h) under one z of the posterior.
     """
@@ -372,8 +373,8 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
         nll, _, z, mean = elbo_terms(belief, posterior, u, h)
         decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
-        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "q": mean, "nll_posterior": nll}
-        part["nll_prior"] = math.log(30) - log_p.logsumexp(-1)
+        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "z_mean": mean}
+        part |= {"nll_prior": math.log(30) - log_p.logsumexp(-1), "nll_posterior": nll}
         part["posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
         part = {name: x.transpose(0, 1) for name, x in {**part, "action": batch["actions"]}.items()}
         parts.append({**part, "cue": batch["cue"]})
@@ -392,13 +393,14 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
         left = (test["u"] - test[source]).square().sum((0, 2))
         report[name] = (1 - left / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
     for name in ("h", "particle", "u"):
-        pairs = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
-        report[f"cue_from_{name}"] = [readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in pairs]
-    z, z_test = (torch.cat([x["q"][:, :-1], x["q"][:, 1:]], -1).flatten(0, 1) for x in (fit, test))
-    actions = (x["action"].flatten(0, 1) for x in (fit, test))
-    report["action_readout"] = readout_score(z, next(actions), z_test, next(actions))
-    classes = [len(column.unique()) for column in fit["cue"].T]
-    report["cue_chance"] = float(np.mean([1 / n if n <= 32 else 0 for n in classes]))
+        steps = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
+        report[f"cue_from_{name}"] = [readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
+    pairs, pairs_test = (torch.cat([x["z_mean"][:, :-1], x["z_mean"][:, 1:]], -1).flatten(0, 1) for x in (fit, test))
+    action, action_test = (x["action"].flatten(0, 1) for x in (fit, test))
+    report["action_readout"] = readout_score(pairs, action, pairs_test, action_test)
+    cue = fit["cue"][:, fit["cue"].amax(0) > fit["cue"].amin(0)]
+    classes = [] if (cue != cue.round()).any() else [len(column.unique()) for column in cue.T]
+    report["cue_chance"] = float(np.mean([1 / n for n in classes])) if classes else 0.0
     return report
 
 
@@ -422,10 +424,10 @@ def plot_diagnostics(report: dict, title: str) -> bytes:
     left.plot(report["cue_from_h"], "C0-", label="from h")
     left.plot(report["cue_from_particle"], "C1--", label="from the mean particle")
     left.axhline(report["cue_chance"], color="grey", linestyle="-.", label="chance")
-    left.set(xlabel="step", ylabel="held-out accuracy, or R2", title="cue, linear read-out", ylim=(-0.05, 1.05))
+    left.set(xlabel="step", ylabel="held-out accuracy, or R2", title="cue, linear read-out", ylim=(-0.5, 1.05))
     right.plot(report["u_r2_posterior"], "k:", label="posterior (sees u)")
     right.plot(report["u_r2_prior"], "C1-", label="prior (mean particle)")
-    right.set(xlabel="step", ylabel="R2", title="reconstruction of u", ylim=(-0.05, 1.05))
+    right.set(xlabel="step", ylabel="R2", title="reconstruction of u", ylim=(-0.5, 1.05))
     for axes in (left, right):
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, frameon=False)
     figure.suptitle(f"{title}: action read-out R2 {report['action_readout']:.3f}")
@@ -515,10 +517,10 @@ def main(args: Args) -> None:
     model.load_state_dict(best)
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (choose, report_on))
     report = diagnose_belief(fit, test)
-    cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)
+    cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)  # for eval/cue_readout of PPO
     known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
     if args.action_head == "flow":
-        report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["q"], test["action"])
+        report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["action"])
         sampled = flow_gain(model["head"], test["z"], test["action"])
         report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())

@@ -107,7 +107,7 @@ class Args:
     """convolutions in bfloat16"""
 
 
-SMALL = dict(exp_name="aib_repr_small", num_episodes=640, epochs=7, batch_size=100, learning_rate=1e-3)
+SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, epochs=7, batch_size=100, learning_rate=1e-3)
 QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_share=0.5, epochs=2)
 
 
@@ -233,6 +233,8 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
     meta = {"format": FORMAT, **asdict(args), "camera": "base_camera", "episodes_done": 0}
     if (path / "meta.json").exists():
         meta = json.loads((path / "meta.json").read_text())
+        if meta["format"] != FORMAT:
+            fail(f"{path} has format {meta['format']}, this script writes {FORMAT}; start anew with --overwrite")
     arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy") if meta["episodes_done"]}
     if meta["episodes_done"] == args.num_episodes:
         return arrays
@@ -243,8 +245,9 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
         now = np.arange(first, min(first + envs.num_envs, count))  # the episodes of this round
         rngs = [np.random.default_rng([args.seed, episode]) for episode in now]
         actions = np.stack([rng.uniform(-1, 1, (steps, action_dim)) for rng in rngs]).astype(np.float32)
-        seeds = (args.seed * 1_000_000 + now) % 2**29 + 2**30
+        seeds = (args.seed * 1_000_000 + now) % 2**29 + 2**30  # above those of PPO's training, below its evaluation's
         obs, info = envs.reset(seed=np.resize(seeds, envs.num_envs).tolist())
+        cue = info["cue"]  # at the start: in Rotate tasks it is what is left to turn
         played = defaultdict(list, rgb=[obs["rgb"]], joints=[obs["joints"]], state=[info["state"]])
         for t in range(steps):
             obs, reward, _, _, info = envs.step(np.resize(actions[:, t], (envs.num_envs, action_dim)))
@@ -252,7 +255,7 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
                 played[name].append(x)
             bar.update(len(now))
         played = {name: torch.stack([torch.as_tensor(x) for x in xs], 1) for name, xs in played.items()}
-        played |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(info["cue"])}
+        played |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue)}
         if not arrays:
             if (size := played["rgb"][0].nbytes * count) > shutil.disk_usage(path.parent).free:
                 fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free; lower --num-episodes")
@@ -284,7 +287,7 @@ def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> 
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
     """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
 
-    The ridge is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
     """
     varies = y.amax(0) > y.amin(0)
     if not varies.any():
@@ -313,8 +316,8 @@ def diagnose_repr(phi: StateEncoder, state: torch.Tensor, cue: torch.Tensor, num
 def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
     num_val = round(args.num_episodes * args.val_share)
-    if not 2 <= num_val < args.num_episodes:
-        fail(f"--val-share {args.val_share} of {args.num_episodes} holds out fewer than two episodes, or all; try 0.1")
+    if not 4 <= num_val < args.num_episodes:  # stage 2 needs two to choose weights and two for its report
+        fail(f"--val-share {args.val_share} of {args.num_episodes} holds out fewer than four episodes, or all; try 0.1")
     check_task(args)
     path, device = open_run(args), torch.device(args.device)
     if (path / "repr.pt").exists():
@@ -387,7 +390,8 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,), state (B, D) without what is observable, cue (B, K), the memory variable itself.
+    Info, privileged: success (B,), cue (B, K), the memory variable itself, and state (B, D), which has the cue and all
+    else that cannot be observed.
     """
 
     def __init__(self, env: gym.Env):
@@ -492,6 +496,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        sys.path
+    )  # else the process they are forked from cannot import this file
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])
@@ -504,6 +511,8 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
+    if args.mesh_triangles and args.sim_backend == "physx_cuda":
+        fail(f"--mesh-triangles {args.mesh_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")

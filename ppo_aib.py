@@ -327,7 +327,7 @@ def rollout_with_belief(
 
     Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
     V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs. All noise is drawn before: results do not depend on the rounds.
+    episodes are played in rounds of envs.num_envs; as all noise is drawn before, nothing depends on them on physx_cpu.
     """
     steps, count, (action_dim,) = envs.spec.max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
@@ -339,7 +339,7 @@ def rollout_with_belief(
     for first in range(0, count, envs.num_envs):
         now = slice(first, min(first + envs.num_envs, count))  # the episodes of this round
         playing = now.stop - now.start  # in the last round some environments may only repeat what others do
-        obs, _ = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
+        obs, start = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
         memory, previous = None, torch.zeros(playing, action_dim, device=device)
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name][:playing], device=device) for name in ("rgb", "joints")}
@@ -352,7 +352,7 @@ def rollout_with_belief(
             step["logprob"] = policy.log_prob(step["action"]).sum(-1)
             previous = step["action"].clamp(-1, 1)
             obs, reward, _, _, info = envs.step(np.resize(previous.cpu().numpy(), (envs.num_envs, action_dim)))
-            for name, x in (("reward", reward), ("success", info["success"]), ("cue", info["cue"])):
+            for name, x in (("reward", reward), ("success", info["success"]), ("cue", start["cue"])):
                 step[name] = torch.as_tensor(x[:playing], dtype=torch.float32, device=device)
             for name, x in step.items():
                 if name not in data:
@@ -389,7 +389,7 @@ def make_video(data: dict[str, torch.Tensor]) -> bytes:
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
     """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
 
-    The ridge is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
     """
     varies = y.amax(0) > y.amin(0)
     if not varies.any():
@@ -418,7 +418,7 @@ def evaluate_with_belief(envs: gym.Env, agent: BeliefAgent, args: Args, known: d
 
 def main(args: Args) -> None:
     """Train an agent that acts on observation and belief, or with --evaluate only evaluate one."""
-    settings = ("env_id", "robot", "mesh_triangles", "num_particles", "particle_noise")  # agent.pt keeps them
+    settings = ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise")
     if args.evaluate:
         file = Path(args.checkpoint.format(**vars(args)))
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
@@ -435,7 +435,7 @@ def main(args: Args) -> None:
         file = Path(args.belief.format(**vars(args)))
         if not file.exists() and args.belief in (Args.belief, SMALL["belief"], QUICK["belief"]):
             run_stage("aib_belief.py", args)
-        hint = f"make it anew with aib_belief.py --env-id {args.env_id} --seed {args.seed} --overwrite"
+        hint = "make it anew with aib_belief.py --overwrite, where --env-id, --seed, --small and --quick are the same"
         task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
         stored = load(file, hint, kind="aib_belief", **task)
 
@@ -472,9 +472,9 @@ def main(args: Args) -> None:
         scalars = {f"train/{name}": value for name, value in success_and_return(data).items()}
         scalars["time/rollout"] = time.time() - start
 
-        values = data["value"]
+        values = data.pop("value")
         data["advantage"] = compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
-        data["return"], data["value"] = data["advantage"] + values[:-1], values[:-1]
+        data["return"] = data["advantage"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in data.items()}
         for _ in range(args.update_epochs):
             for index in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
@@ -525,7 +525,8 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,), state (B, D) without what is observable, cue (B, K), the memory variable itself.
+    Info, privileged: success (B,), cue (B, K), the memory variable itself, and state (B, D), which has the cue and all
+    else that cannot be observed.
     """
 
     def __init__(self, env: gym.Env):
@@ -630,6 +631,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        sys.path
+    )  # else the process they are forked from cannot import this file
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])
@@ -642,6 +646,8 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
+    if args.mesh_triangles and args.sim_backend == "physx_cuda":
+        fail(f"--mesh-triangles {args.mesh_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")

@@ -207,7 +207,7 @@ def rollout(
     """Play one whole episode per seed; without explore, actions are the policy's means.
 
     Returns arrays (T, N, ...): rgb uint8, joints, action, logprob, reward, success; and value (T+1, N), V(o_T) last.
-    The episodes are played in rounds of envs.num_envs. All noise is drawn before: results do not depend on the rounds.
+    Episodes are played in rounds of envs.num_envs; as all noise is drawn before, nothing depends on them on physx_cpu.
     """
     steps, count, (action_dim,) = envs.spec.max_episode_steps, len(seeds), envs.single_action_space.shape
     device = torch.device(args.device)
@@ -273,7 +273,7 @@ def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args) -> tuple[dict
 
 def main(args: Args) -> None:
     """Train an agent that acts on the present observation alone, or with --evaluate only evaluate one."""
-    settings = ("env_id", "robot", "mesh_triangles")  # agent.pt keeps them
+    settings = ("env_id", "robot", "mesh_triangles", "num_envs", "amp")  # agent.pt keeps them
     if args.evaluate:
         file = Path(args.checkpoint.format(**vars(args)))
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_baseline agent")
@@ -319,9 +319,9 @@ def main(args: Args) -> None:
         scalars = {f"train/{name}": value for name, value in success_and_return(data).items()}
         scalars["time/rollout"] = time.time() - start
 
-        values = data["value"]
+        values = data.pop("value")
         data["advantage"] = compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
-        data["return"], data["value"] = data["advantage"] + values[:-1], values[:-1]
+        data["return"] = data["advantage"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in data.items()}
         for _ in range(args.update_epochs):
             for index in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
@@ -370,7 +370,8 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,), state (B, D) without what is observable, cue (B, K), the memory variable itself.
+    Info, privileged: success (B,), cue (B, K), the memory variable itself, and state (B, D), which has the cue and all
+    else that cannot be observed.
     """
 
     def __init__(self, env: gym.Env):
@@ -475,6 +476,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        sys.path
+    )  # else the process they are forked from cannot import this file
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])
@@ -487,6 +491,8 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
+    if args.mesh_triangles and args.sim_backend == "physx_cuda":
+        fail(f"--mesh-triangles {args.mesh_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")

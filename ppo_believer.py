@@ -169,7 +169,7 @@ TASKS = {  # Table 5, where it differs from the defaults above, which are Interc
 }
 SMALL = dict(exp_name="ppo_believer_small", total_timesteps=200_000, num_envs=16, learning_rate=3e-4, gamma=0.95)
 SMALL |= dict(update_epochs=4, num_minibatches=8, eval_every=20, num_eval_episodes=64)
-SMALL |= dict(num_episodes=640, num_updates=300, batch_episodes=16, belief_lr=1e-3)
+SMALL |= dict(num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
 QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_eval_episodes=2)
 QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_episodes=8, num_updates=4, batch_episodes=4)
@@ -421,7 +421,7 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     path = Path(args.repr_dir.format(**vars(args)))
     if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"]):
         run_stage("aib_repr.py", args)
-    hint = f"make it anew with aib_repr.py --env-id {args.env_id} --seed {args.seed} --overwrite"
+    hint = "make it anew with aib_repr.py --overwrite, where --env-id, --seed, --small and --quick are the same as here"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
     try:
@@ -444,7 +444,7 @@ def rollout_with_belief(
 
     Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
     V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs. All noise is drawn before: results do not depend on the rounds.
+    episodes are played in rounds of envs.num_envs; as all noise is drawn before, nothing depends on them on physx_cpu.
     """
     steps, count, (action_dim,) = envs.spec.max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
@@ -456,7 +456,7 @@ def rollout_with_belief(
     for first in range(0, count, envs.num_envs):
         now = slice(first, min(first + envs.num_envs, count))  # the episodes of this round
         playing = now.stop - now.start  # in the last round some environments may only repeat what others do
-        obs, _ = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
+        obs, start = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
         memory, previous = None, torch.zeros(playing, action_dim, device=device)
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name][:playing], device=device) for name in ("rgb", "joints")}
@@ -469,7 +469,7 @@ def rollout_with_belief(
             step["logprob"] = policy.log_prob(step["action"]).sum(-1)
             previous = step["action"].clamp(-1, 1)
             obs, reward, _, _, info = envs.step(np.resize(previous.cpu().numpy(), (envs.num_envs, action_dim)))
-            for name, x in (("reward", reward), ("success", info["success"]), ("cue", info["cue"])):
+            for name, x in (("reward", reward), ("success", info["success"]), ("cue", start["cue"])):
                 step[name] = torch.as_tensor(x[:playing], dtype=torch.float32, device=device)
             for name, x in step.items():
                 if name not in data:
@@ -486,7 +486,7 @@ def rollout_with_belief(
 def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
     """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
 
-    The ridge is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
     """
     varies = y.amax(0) > y.amin(0)
     if not varies.any():
@@ -502,7 +502,7 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
 def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: np.ndarray) -> dict[str, torch.Tensor]:
     """What the belief makes of episodes index (E,), each (E, T+1, .): h, u, action (E, T, A), cue (E, K), and
 
-    particle: the mean of 30 decoded prior samples; z, q: a sample and the mean of the posterior; posterior: q decoded;
+    particle: the mean of 30 decoded prior samples; z, z_mean: the posterior's sample and mean; posterior: that decoded;
     nll_prior: -log p(u|h) (E, T+1), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows
     of three possible places is right about each; nll_posterior: -log p(u|z,h) under one z of the posterior.
     """
@@ -514,8 +514,8 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
         nll, _, z, mean = elbo_terms(belief, posterior, u, h)
         decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
-        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "q": mean, "nll_posterior": nll}
-        part["nll_prior"] = math.log(30) - log_p.logsumexp(-1)
+        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "z_mean": mean}
+        part |= {"nll_prior": math.log(30) - log_p.logsumexp(-1), "nll_posterior": nll}
         part["posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
         part = {name: x.transpose(0, 1) for name, x in {**part, "action": batch["actions"]}.items()}
         parts.append({**part, "cue": batch["cue"]})
@@ -534,13 +534,14 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
         left = (test["u"] - test[source]).square().sum((0, 2))
         report[name] = (1 - left / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
     for name in ("h", "particle", "u"):
-        pairs = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
-        report[f"cue_from_{name}"] = [readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in pairs]
-    z, z_test = (torch.cat([x["q"][:, :-1], x["q"][:, 1:]], -1).flatten(0, 1) for x in (fit, test))
-    actions = (x["action"].flatten(0, 1) for x in (fit, test))
-    report["action_readout"] = readout_score(z, next(actions), z_test, next(actions))
-    classes = [len(column.unique()) for column in fit["cue"].T]
-    report["cue_chance"] = float(np.mean([1 / n if n <= 32 else 0 for n in classes]))
+        steps = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
+        report[f"cue_from_{name}"] = [readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
+    pairs, pairs_test = (torch.cat([x["z_mean"][:, :-1], x["z_mean"][:, 1:]], -1).flatten(0, 1) for x in (fit, test))
+    action, action_test = (x["action"].flatten(0, 1) for x in (fit, test))
+    report["action_readout"] = readout_score(pairs, action, pairs_test, action_test)
+    cue = fit["cue"][:, fit["cue"].amax(0) > fit["cue"].amin(0)]
+    classes = [] if (cue != cue.round()).any() else [len(column.unique()) for column in cue.T]
+    report["cue_chance"] = float(np.mean([1 / n for n in classes])) if classes else 0.0
     return report
 
 
@@ -552,10 +553,10 @@ def plot_diagnostics(report: dict, title: str) -> bytes:
     left.plot(report["cue_from_h"], "C0-", label="from h")
     left.plot(report["cue_from_particle"], "C1--", label="from the mean particle")
     left.axhline(report["cue_chance"], color="grey", linestyle="-.", label="chance")
-    left.set(xlabel="step", ylabel="held-out accuracy, or R2", title="cue, linear read-out", ylim=(-0.05, 1.05))
+    left.set(xlabel="step", ylabel="held-out accuracy, or R2", title="cue, linear read-out", ylim=(-0.5, 1.05))
     right.plot(report["u_r2_posterior"], "k:", label="posterior (sees u)")
     right.plot(report["u_r2_prior"], "C1-", label="prior (mean particle)")
-    right.set(xlabel="step", ylabel="R2", title="reconstruction of u", ylim=(-0.05, 1.05))
+    right.set(xlabel="step", ylabel="R2", title="reconstruction of u", ylim=(-0.5, 1.05))
     for axes in (left, right):
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, frameon=False)
     figure.suptitle(f"{title}: action read-out R2 {report['action_readout']:.3f}")
@@ -671,17 +672,17 @@ def train_belief(args: Args, path: Path) -> None:
     model.load_state_dict(best)
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (choose, report_on))
     report = diagnose_belief(fit, test)
-    cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)
+    cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)  # for eval/cue_readout of PPO
     known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     save(path / "diagnostics.png", plot_diagnostics(report, f"{args.env_id}, {args.exp_name}"))
     content = {"kind": "believer_belief", "config": config, "known": known}
-    save(path / "belief.pt", {**content, "belief": model["belief"].state_dict(), "training": model.state_dict()})
+    save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
 
 
 def main(args: Args) -> None:
     """Train belief and agent of the Believer baseline, or with --evaluate only evaluate an agent."""
-    settings = ("env_id", "robot", "mesh_triangles", "num_particles", "particle_noise")  # agent.pt keeps them
+    settings = ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise")
     if args.evaluate:
         file = Path(args.checkpoint.format(**vars(args)))
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_believer agent")
@@ -733,9 +734,9 @@ def main(args: Args) -> None:
         scalars = {f"train/{name}": value for name, value in success_and_return(data).items()}
         scalars["time/rollout"] = time.time() - start
 
-        values = data["value"]
+        values = data.pop("value")
         data["advantage"] = compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
-        data["return"], data["value"] = data["advantage"] + values[:-1], values[:-1]
+        data["return"] = data["advantage"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in data.items()}
         for _ in range(args.update_epochs):
             for index in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
@@ -786,7 +787,8 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,), state (B, D) without what is observable, cue (B, K), the memory variable itself.
+    Info, privileged: success (B,), cue (B, K), the memory variable itself, and state (B, D), which has the cue and all
+    else that cannot be observed.
     """
 
     def __init__(self, env: gym.Env):
@@ -891,6 +893,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        sys.path
+    )  # else the process they are forked from cannot import this file
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])
@@ -903,6 +908,8 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
+    if args.mesh_triangles and args.sim_backend == "physx_cuda":
+        fail(f"--mesh-triangles {args.mesh_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")
