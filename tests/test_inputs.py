@@ -49,6 +49,12 @@ def test_no_rendering_device(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_light_meshes_only_where_there_is_one_scene_per_process(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as stop:
+        ppo_aib.check_task(ppo_aib.Args(sim_backend="physx_cuda", mesh_triangles=500))
+    refused((stop.value.code, *capsys.readouterr()), "--mesh-triangles 500", "physx_cpu")
+
+
 def test_a_folder_that_cannot_be_written() -> None:
     """Even root may not make a folder in /sys."""
     refused(run("ppo_baseline", cwd=Path("/sys")), "cannot be written")

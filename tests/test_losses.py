@@ -19,6 +19,7 @@ from conftest import TOY
 IMAGE = [36, 36, 3]
 CONFIG = {"image_shape": IMAGE, "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
 T, B, A = 6, 3, 2
+SELECT, REPORT = slice(0, 20), slice(20, 40)
 
 
 def belief_model(head: str = "flow", config: dict = CONFIG) -> nn.ModuleDict:
@@ -300,6 +301,23 @@ def test_readout_score_on_features_of_known_content() -> None:
     assert -0.1 < score(noise, count=210) < 0.1, "as many episodes as features: without a good ridge far below 0"
     constant = torch.ones(3000, 1)
     assert score(torch.cat([signal, constant], 1)) == pytest.approx(score(signal)), "what never varies does not count"
+
+
+def test_report_of_a_belief_that_knows_and_of_its_chance() -> None:
+    torch.manual_seed(0)
+    velocity, colour = torch.randn(40, 3), torch.randint(0, 4, (40, 1)).float()
+    velocity[:, 2] = 0  # the ball stays on the table
+    for cue, chance in ((velocity, 0.0), (colour, 0.25), (torch.cat([colour, colour > 1], 1), (0.25 + 0.5) / 2)):
+        u = cue[:, None].expand(-1, T + 1, -1).clone()
+        known = torch.nn.functional.one_hot(colour[:, 0].long(), 4)[:, None].float().expand(-1, T + 1, -1)
+        seen = {"u": u, "particle": u + 0.1, "posterior": u, "h": torch.cat([u, known], -1), "cue": cue}
+        seen |= {"nll_prior": torch.ones(40, T + 1), "nll_posterior": torch.zeros(40, T + 1)}
+        seen |= {"z_mean": torch.randn(40, T + 1, 5), "action": torch.rand(40, T, A)}
+        report = aib_belief.diagnose_belief(*({name: x[part] for name, x in seen.items()} for part in (SELECT, REPORT)))
+        assert report["cue_chance"] == pytest.approx(chance) and report["prior_gap"] == 1
+        assert min(report["cue_from_h"]) > 0.95 and min(report["u_r2_posterior"]) == 1
+        left = 0.01 * cue[REPORT].numel() / (cue[REPORT] - cue[REPORT].mean(0)).square().sum()
+        assert report["u_r2_prior"][0] == pytest.approx(1 - left.item(), abs=1e-5)
 
 
 def test_flow_gain_tells_a_live_head_from_a_dead_one() -> None:
