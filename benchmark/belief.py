@@ -1,10 +1,10 @@
-"""Does the belief remember? Stage 1 and 2 with their ablations and Believer's belief on one task, and stage 2's speed.
+"""Does the belief remember? Stage 1 and 2 with --small, ablations and Believer's belief on one task; stage 2's speed.
 
 Every row is trained for the same number of updates on the same data by the scripts themselves, and read from their
-diagnostics.json. Runs are kept in runs/*bench*: the same command goes on with what is unfinished.
+diagnostics.json. The same command goes on with what is unfinished.
 
 Usage:   python benchmark/belief.py                                  (RememberColor3-v0, `make bench-belief`)
-         python benchmark/belief.py --env-id InterceptFast-v0 --rows flow "flow lambda 0.1" "flow lambda 10"
+         python benchmark/belief.py --env-id InterceptFast-v0 --rows flow mse none believer --seeds 1 2 3
 """
 
 import ctypes
@@ -16,6 +16,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn as nn
 import tyro
@@ -25,43 +26,43 @@ sys.path += [str(ROOT), str(ROOT / "tests")]
 import aib_belief  # noqa: E402
 from per_step_loop import PerStepHistory  # noqa: E402
 
-ROWS = {
+ROWS = {  # what follows --small
     "flow": [],
+    "flow, samples": ["--fm-latent", "sample"],
+    "flow, images only": ["--no-history-joints"],
+    "flow, lambda 0.1": ["--action-lambda", "0.1"],
+    "flow, lambda 10": ["--action-lambda", "10"],
     "mse": ["--action-head", "mse"],
     "none": ["--action-head", "none"],
     "plain": ["--image-norm", "none", "--no-chrono-init", "--bptt-steps", "16"],
     "believer": [],
-    "flow lambda 0.1": ["--action-lambda", "0.1"],
-    "flow lambda 10": ["--action-lambda", "10"],
-    "flow joints": ["--history-joints"],
 }
 BELIEVER = """
 import ppo_believer as b
-args = b.parse_args({}, {}, {})
+args = b.parse_args({}, b.SMALL, {})
 path = b.open_run(args)
 if not (path / "belief.pt").exists():
     b.train_belief(args, path)
 """
+COLUMNS = {
+    "cue from h": "cue_from_h",
+    "cue from particle": "cue_from_particle",
+    "R2 of u, particle": "u_r2_prior",
+    "nll prior": "nll_prior",
+    "nll posterior": "nll_posterior",
+    "action R2": "action_readout",
+    "flow gain": "flow_gain",
+}
 
 
 @dataclass
 class Args:
     env_id: str = "RememberColor3-v0"
     """MIKASA-Robo task"""
-    rows: list[str] = field(default_factory=lambda: ["flow", "mse", "none", "plain", "believer"])
+    rows: list[str] = field(default_factory=lambda: ["flow", "none", "believer"])
     """which rows of the table"""
-    robot: str = "panda_wristcam"
-    """robot of the scripts"""
-    num_episodes: int = 320
-    """episodes of the random policy, a tenth of them held out"""
-    epochs: int = 13
-    """of stage 1, in updates of 100 transitions: some 2,200 updates on 320 episodes of 60 steps"""
-    num_updates: int = 240
-    """of stage 2"""
-    batch_episodes: int = 16
-    """whole episodes per update of stage 2"""
-    belief_lr: float = 1e-3
-    """learning rate of stage 2"""
+    seeds: list[int] = field(default_factory=lambda: [1])
+    """seeds, each with a dataset and a state encoder of its own"""
     speed: bool = True
     """compare stage 2's update with a per-step GRUCell loop"""
 
@@ -108,51 +109,43 @@ def speed(device: torch.device) -> str:
     return f"stage-2 update, {episodes} episodes x {steps} steps, against a per-step loop in float32: {ratios}"
 
 
+def cell(reports: list[dict], key: str, steps: list[int]) -> str:
+    """One entry of the table, by steps where there are: mean over seeds, with their sample deviation from two on."""
+    if key not in reports[0]:
+        return "-"
+    columns = zip(*([r[key][t] for t in steps] if isinstance(r[key], list) else [r[key]] for r in reports), strict=True)
+    return " / ".join(
+        f"{np.mean(column):.2f} ± {np.std(column, ddof=1):.2f}" if len(column) > 1 else f"{column[0]:.2f}"
+        for column in columns
+    )
+
+
 def main(args: Args) -> None:
     """Run what is missing and print the table."""
-    base = ["--env-id", args.env_id, "--robot", args.robot]
-    repr_dir = Path("runs") / f"{args.env_id}__bench_repr__1"
-    sizes = ["--num-episodes", str(args.num_episodes), "--val-share", "0.1", "--epochs", str(args.epochs)]
-    sizes += ["--batch-size", "100", "--learning-rate", "1e-3"]
-    took = {"stage 1": run([str(ROOT / "aib_repr.py"), *base, "--exp-name", "bench_repr", *sizes, "--num-envs", "20"])}
-    updates = ["--repr-dir", str(repr_dir), "--num-updates", str(args.num_updates)]
-    updates += ["--batch-episodes", str(args.batch_episodes), "--belief-lr", str(args.belief_lr)]
-    reports = {}
-    for row in args.rows:
-        name = "bench_" + row.replace(" ", "_")
-        script = ["-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}){BELIEVER}"]
-        script = script if row == "believer" else [str(ROOT / "aib_belief.py")]
-        took[row] = run([*script, *base, "--exp-name", name, *updates, *ROWS[row]])
-        path = Path("runs") / f"{args.env_id}__{name}__1"
-        reports[row] = json.loads((path / "diagnostics.json").read_text())
-    stage1 = json.loads((repr_dir / "diagnostics.json").read_text())
-    last = len(reports[args.rows[0]]["u_r2_prior"]) - 2
-    steps = [4, 9, 30, last]
+    reports, took = {row: [] for row in args.rows}, {}
+    for seed in args.seeds:
+        base = ["--env-id", args.env_id, "--seed", str(seed), "--small"]
+        run([str(ROOT / "aib_repr.py"), *base])
+        for row in args.rows:
+            name = "aib_belief_small" + "".join(f"_{word.strip(',')}" for word in row.split() if row != "flow")
+            name = "ppo_believer_small" if row == "believer" else name
+            script = ["-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}){BELIEVER}"]
+            script = script if row == "believer" else [str(ROOT / "aib_belief.py")]
+            took[row] = run([*script, *base, "--exp-name", name, *ROWS[row]])
+            path = Path("runs") / f"{args.env_id}__{name}__{seed}"
+            reports[row].append(json.loads((path / "diagnostics.json").read_text()))
+    first = reports[args.rows[0]]
+    steps = [4, 9, 30, len(first[0]["u_r2_prior"]) - 2]
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    print(f"\n{args.env_id}, {args.robot}, {args.num_episodes} episodes (a tenth held out), {args.num_updates}")
-    print(f"updates of {args.batch_episodes} episodes, torch {torch.__version__} on {device}")
-    print("stage 1: " + ", ".join(f"{name} {value:.3f}" for name, value in stage1.items()))
-    print(f"cue read-out: chance {reports[args.rows[0]]['cue_chance']:.3f}; steps {steps}\n")
-    columns = [
-        "cue from h",
-        "cue from particle",
-        "R2 of u, prior",
-        "nll prior",
-        "nll posterior",
-        "action R2",
-        "flow gain",
-    ]
-    print("| belief | " + " | ".join(columns) + " | seconds |\n|" + "---|" * (len(columns) + 2))
-    for row, report in reports.items():
-        cells = [
-            " ".join(f"{report[key][t]:.2f}" for t in steps)
-            for key in ("cue_from_h", "cue_from_particle", "u_r2_prior")
-        ]
-        cells += [f"{report[key]:.2f}" for key in ("nll_prior", "nll_posterior")]
-        cells += [f"{report['action_readout']:.3f}", f"{report['flow_gain']:.3f}" if "flow_gain" in report else "-"]
+    print(
+        f"\n{args.env_id}, --small, {len(args.seeds)} seeds, torch {torch.__version__} on {device}; steps {steps}; ",
+        end="",
+    )
+    print(f"cue: chance {first[0]['cue_chance']:.2f}, from u {cell(first, 'cue_from_u', steps)}\n")
+    print("| belief | " + " | ".join(COLUMNS) + " | seconds |\n|" + "---|" * (len(COLUMNS) + 2))
+    for row, found in reports.items():
+        cells = [cell(found, key, steps) for key in COLUMNS.values()]
         print(f"| {row} | " + " | ".join(cells) + f" | {took[row]:.0f} |")
-    ceiling = " ".join(f"{reports[args.rows[0]]['cue_from_u'][t]:.2f}" for t in steps)
-    print(f"\nceiling, cue from u: {ceiling}; stage 1 took {took['stage 1']:.0f} s (0 to a few: it was there already)")
     if args.speed:
         print(speed(torch.device(device)))
 
