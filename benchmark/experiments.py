@@ -41,6 +41,10 @@ class Args:
     """seeds of every experiment"""
     ablations: bool = True
     """also the action heads and loss weights on InterceptFast-v0"""
+    small: bool = False
+    """with the scripts' --small, on any tasks, without ablations"""
+    quick: bool = False
+    """with the scripts' --quick, likewise"""
     dry_run: bool = False
     """only print the commands"""
     phase: int | None = None
@@ -52,13 +56,14 @@ class Args:
 def commands(args: Args) -> dict[int, list[list[str]]]:
     """The commands of each phase, as lists of words after `python`."""
     phases = {1: [], 2: [], 3: []}
+    size = ["--small"] * args.small + ["--quick"] * args.quick
     for task in args.tasks:
         for seed in args.seeds:
-            run = ["--env-id", task, "--seed", str(seed)]
+            run = ["--env-id", task, "--seed", str(seed), *size]
             phases[1].append(["aib_repr.py", *run])
             phases[2].append(["aib_belief.py", *run])
             phases[3] += [[f"{script}.py", *run] for script in ("ppo_aib", "ppo_believer", "ppo_baseline")]
-    if args.ablations and "InterceptFast-v0" in args.tasks:
+    if args.ablations and not size and "InterceptFast-v0" in args.tasks:
         for name, change in ABLATIONS.items():
             for seed in args.seeds:
                 run = ["--env-id", "InterceptFast-v0", "--seed", str(seed)]

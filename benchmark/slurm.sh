@@ -9,6 +9,7 @@
 #SBATCH --output=runs/slurm-%x-%A_%a.log
 #
 # Submit all of the paper's experiments with one line, from the repository's root:   bash benchmark/slurm.sh
+# or some, with arguments of experiments.py:   bash benchmark/slurm.sh --small --tasks RememberColor3-v0
 # Three job arrays follow one another: stage 1, the beliefs, PPO. A job that is preempted or runs into its time limit
 # is queued again and goes on from its last checkpoint. Change the lines above to what your cluster wants.
 set -euo pipefail
@@ -17,15 +18,15 @@ if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
     mkdir -p runs
     after=
     for phase in 1 2 3; do
-        count=$(.venv/bin/python benchmark/experiments.py --dry-run --phase "$phase" | wc -l)
-        job=$(sbatch --parsable --array="0-$((count - 1))" $after --export="ALL,PHASE=$phase" "$0")
+        count=$(.venv/bin/python benchmark/experiments.py "$@" --dry-run --phase "$phase" | wc -l)
+        job=$(sbatch --parsable --array="0-$((count - 1))" $after --export="ALL,PHASE=$phase" "$0" "$@")
         echo "phase $phase: $count jobs, array $job"
         after="--dependency=afterok:$job"
     done
     exit 0
 fi
 
-.venv/bin/python benchmark/experiments.py --phase "$PHASE" --index "$SLURM_ARRAY_TASK_ID" &
+.venv/bin/python benchmark/experiments.py "$@" --phase "$PHASE" --index "$SLURM_ARRAY_TASK_ID" &
 child=$!
 # an abrupt end loses nothing but the work since the last checkpoint
 trap 'scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"; pkill -P "$child"' USR1
