@@ -25,6 +25,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each process
     os.environ["OMP_NUM_THREADS"] = "1"
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Where tests run in several processes, those that share a slow fixture go to the same one."""
     for item in items:
