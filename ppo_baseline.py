@@ -39,6 +39,7 @@ from tqdm import tqdm
 
 FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
@@ -113,8 +114,8 @@ TASKS = {  # Table 5, where it differs from the defaults above, which are Interc
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
-SMALL = dict(exp_name="ppo_baseline_small", total_timesteps=200_000, num_envs=16, learning_rate=3e-4, gamma=0.95)
-SMALL |= dict(update_epochs=4, num_minibatches=8, eval_every=20, num_eval_episodes=64)
+SMALL = dict(exp_name="ppo_baseline_small", total_timesteps=240_000, num_envs=16, learning_rate=3e-4, gamma=0.95)
+SMALL |= dict(update_epochs=8, num_minibatches=8, target_kl=0.1, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
 QUICK = dict(exp_name="ppo_baseline_quick", total_timesteps=360, num_envs=2, num_eval_episodes=2)
 
 
