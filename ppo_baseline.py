@@ -8,6 +8,7 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, Tensor
 import argparse
 import fcntl
 import json
+import math
 import multiprocessing
 import os
 import shutil
@@ -102,6 +103,8 @@ class Args:
     """iterations between evaluations"""
     num_eval_episodes: int = 192
     """episodes per evaluation, the same every time"""
+    init_std: float = math.exp(-0.5)
+    """standard deviation of the actions at the start"""
     amp: bool = False
     """convolutions in bfloat16"""
     evaluate: bool = False
@@ -150,14 +153,14 @@ class NatureCNN(nn.Module):
 class Agent(nn.Module):
     """Actor and critic on image and joints."""
 
-    def __init__(self, image_shape: list[int], joints_dim: int, action_dim: int, amp: bool = False):
+    def __init__(self, image_shape: list[int], joints_dim: int, action_dim: int, init_std: float, amp: bool = False):
         super().__init__()
         self.cnn = orthogonal_init(NatureCNN(image_shape, 256, amp))
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(joints_dim, 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
         self.critic = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, 1)))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
-        self.log_std = nn.Parameter(torch.full((action_dim,), -0.5))
+        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(init_std)))
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of rgb (B, H, W, 3) uint8 and joints (B, J)."""
@@ -291,7 +294,7 @@ def main(args: Args) -> None:
     envs, device = make_envs(args), torch.device(args.device)
     image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
     torch.manual_seed(args.seed)
-    agent = Agent(image_shape, joints_dim, envs.single_action_space.shape[0], args.amp).to(device)
+    agent = Agent(image_shape, joints_dim, envs.single_action_space.shape[0], args.init_std, args.amp).to(device)
     if args.evaluate:
         agent.load_state_dict(stored["agent"])
         metrics, video = evaluate(envs, agent, args)
@@ -303,11 +306,10 @@ def main(args: Args) -> None:
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     per_iteration = envs.spec.max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // per_iteration)
-    first, rows = 0, []
+    first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first, rows = checkpoint["iteration"], checkpoint["rows"]
         print(f"going on with {path} at step {first * per_iteration:,}", flush=True)
     writer = SummaryWriter(path, purge_step=first * per_iteration + 1)
     bar = tqdm(total=num_iterations * per_iteration, initial=first * per_iteration, desc="PPO", unit="step")

@@ -155,6 +155,8 @@ class Args:
     """iterations between evaluations"""
     num_eval_episodes: int = 192
     """episodes per evaluation, the same every time"""
+    init_std: float = math.exp(-0.5)
+    """standard deviation of the actions at the start"""
     amp: bool = False
     """convolutions in bfloat16"""
     evaluate: bool = False
@@ -310,7 +312,7 @@ class BelieverBelief(nn.Module):
 class BeliefAgent(nn.Module):
     """Actor and critic on image, joints and belief (paper 3.3): W(b) = W_agg(mean over particles of W_enc(u_i))."""
 
-    def __init__(self, belief: nn.Module, joints_dim: int, action_dim: int, amp: bool = False):
+    def __init__(self, belief: nn.Module, joints_dim: int, action_dim: int, init_std: float, amp: bool = False):
         super().__init__()
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(belief.config["image_shape"], 256, amp))
@@ -320,7 +322,7 @@ class BeliefAgent(nn.Module):
         self.actor = orthogonal_init(mlp([256 + 128 + 64, 512, action_dim]))
         self.critic = orthogonal_init(mlp([256 + 128 + 64, 512, 1]))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
-        self.log_std = nn.Parameter(torch.full((action_dim,), -0.5))
+        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(init_std)))
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u)."""
@@ -704,7 +706,8 @@ def main(args: Args) -> None:
     envs, device = make_envs(args), torch.device(args.device)
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     torch.manual_seed(args.seed)
-    agent = BeliefAgent(BelieverBelief(stored["config"], args.amp), joints_dim, action_dim, args.amp).to(device)
+    belief = BelieverBelief(stored["config"], args.amp)
+    agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
     if args.evaluate:
         agent.load_state_dict(stored["agent"])
         metrics, video = evaluate_with_belief(envs, agent, args, stored["known"])
@@ -717,11 +720,10 @@ def main(args: Args) -> None:
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     per_iteration = envs.spec.max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // per_iteration)
-    first, rows = 0, []
+    first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first, rows = checkpoint["iteration"], checkpoint["rows"]
         print(f"going on with {path} at step {first * per_iteration:,}", flush=True)
     writer = SummaryWriter(path, purge_step=first * per_iteration + 1)
     bar = tqdm(total=num_iterations * per_iteration, initial=first * per_iteration, desc="PPO", unit="step")

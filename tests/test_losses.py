@@ -170,7 +170,7 @@ def test_believer_has_a_fixed_prior() -> None:
 def test_particles_are_draws_from_prior_and_decoder() -> None:
     torch.manual_seed(0)
     belief, batch = ppo_aib.AIBBelief(CONFIG), belief_batch()
-    agent = ppo_aib.BeliefAgent(belief, 7, A)
+    agent = ppo_aib.BeliefAgent(belief, 7, A, 0.6)
     z_noise, u_noise = torch.randn(B, 30, 5), torch.randn(B, 30, 4)
     memory = None
     for t in range(2):
@@ -352,7 +352,7 @@ def test_gae_is_the_double_sum() -> None:
 
 def test_belief_aggregator_is_the_papers_formula_and_ignores_the_order_of_particles() -> None:
     torch.manual_seed(0)
-    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG), 7, A)
+    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG), 7, A, 0.6)
     obs = {"rgb": torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8), "joints": torch.randn(B, 7)}
     particles = torch.randn(B, 30, 4)
     policy, value = agent({**obs, "particles": particles})

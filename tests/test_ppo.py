@@ -36,7 +36,7 @@ def play(toy_stages: Path, amp: bool = False) -> tuple[ppo_aib.BeliefAgent, dict
     args = ppo_aib.Args(env_id=TOY, **small(ppo_aib, toy_stages, amp=amp))
     stored = torch.load(args.belief, weights_only=True)
     torch.manual_seed(0)
-    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(stored["config"], amp), 3, 2, amp)
+    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(stored["config"], amp), 3, 2, 0.6, amp)
     agent.belief.load_state_dict(stored["belief"])
     torch.manual_seed(1)
     return agent, ppo_aib.rollout_with_belief(toy.make_envs(args), agent, args, np.arange(8))
@@ -118,7 +118,7 @@ def test_the_belief_is_frozen_and_the_aggregator_learns(toy_task: Path, toy_stag
     assert all(torch.equal(trained["agent"][f"belief.{name}"], value) for name, value in before.items())
     torch.manual_seed(1)
     belief = (ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief)(trained["config"])
-    start = module.BeliefAgent(belief, 3, 2).state_dict()
+    start = module.BeliefAgent(belief, 3, 2, module.Args.init_std).state_dict()
     for part in ("w_enc.0.weight", "w_agg.2.weight", "cnn.conv.0.weight", "actor.2.weight", "log_std"):
         assert not torch.equal(trained["agent"][part], start[part]), part
 
@@ -144,7 +144,7 @@ def test_any_number_of_workers_gives_the_same_training_and_evaluation(
 
 
 def test_orthogonal_initialisation() -> None:
-    agent = ppo_baseline.Agent([36, 36, 3], 3, 2)
+    agent = ppo_baseline.Agent([36, 36, 3], 3, 2, ppo_baseline.Args.init_std)
     for layer, gain in ((agent.joints[0], 2**0.5), (agent.actor[2], 0.01 * 2**0.5), (agent.critic[2], 2**0.5)):
         gram = layer.weight @ layer.weight.T if layer.weight.shape[0] <= layer.weight.shape[1] else None
         gram = layer.weight.T @ layer.weight if gram is None else gram
