@@ -18,19 +18,13 @@ import toy
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {module.__name__: module for module in (aib_repr, aib_belief, ppo_aib, ppo_believer, ppo_baseline)}
+# where tests run in several processes, those that share a slow fixture go to the same one
+SHARES_QUICK_RUNS, SHARES_REFERENCE = pytest.mark.xdist_group("quick_runs"), pytest.mark.xdist_group("reference")
 TASK, TOY = "RememberColor9-v0", "ToyMemory-v0"
 os.environ["TQDM_MININTERVAL"] = "30"
 if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each process
     torch.set_num_threads(1)
     os.environ["OMP_NUM_THREADS"] = "1"
-
-
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Where tests run in several processes, those that share a slow fixture go to the same one."""
-    for item in items:
-        for fixture in {"quick_runs", "reference"}.intersection(item.fixturenames):
-            item.add_marker(pytest.mark.xdist_group(fixture))
 
 
 def run(script: str, *arguments: str, cwd: Path, env: dict | None = None, timeout: float = 600) -> tuple[int, str, str]:

@@ -10,7 +10,9 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from conftest import TASK, run
+from conftest import SHARES_QUICK_RUNS, TASK, run
+
+pytestmark = SHARES_QUICK_RUNS
 
 
 def test_dataset(quick_runs: Path) -> None:

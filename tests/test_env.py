@@ -10,7 +10,7 @@ import pytest
 import sapien
 
 import aib_repr
-from conftest import TASK
+from conftest import SHARES_QUICK_RUNS, TASK
 
 # RememberColor9's nine colours have six hues on the screen: maroon is a dark red, olive reads as yellow, teal as cyan
 HUES = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [255, 0, 255], [0, 255, 255]])
@@ -56,6 +56,7 @@ def test_cue_then_nothing_then_nine_cubes_that_rest_on_the_table(env: gym.Env) -
     assert np.allclose(heights, 0.02, atol=0.005), "as on the GPU simulator, instead of falling from z = 1000"
 
 
+@SHARES_QUICK_RUNS
 def test_an_episode_follows_from_its_seed_and_actions_in_whatever_process(env: gym.Env, quick_runs: Path) -> None:
     dataset = quick_runs / f"{TASK}__aib_repr_quick__1" / "dataset"
     arrays = {file.stem: np.load(file) for file in dataset.glob("*.npy")}

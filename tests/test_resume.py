@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import ROOT, TASK, run
+from conftest import ROOT, SHARES_QUICK_RUNS, SHARES_REFERENCE, TASK, run
 from kill_table import KILLS, kill_and_go_on, make_reference, results
 
 CHOSEN = ["env.step:27", "repr_losses:6", "torch.save:2", "ppo_losses:11", "believer_losses:3", "env.step:62"]
@@ -25,6 +25,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@SHARES_REFERENCE
 @pytest.mark.parametrize(
     "script, moment",
     [
@@ -57,6 +58,7 @@ def listen_to_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@SHARES_QUICK_RUNS
 def test_real_workers_end_with_their_parent_killed_or_stopped(quick_runs: Path, tmp_path: Path) -> None:
     """Kill a chain of stages outright, stop it by Ctrl-C, then let it go on to the same dataset."""
     meta = tmp_path / "runs" / f"{TASK}__aib_repr_quick__1" / "dataset" / "meta.json"
