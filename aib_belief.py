@@ -45,7 +45,9 @@ from tqdm import tqdm
 FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 FRAMES = 2048  # images through a belief's CNN at a time: their activations take some 2 GB
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
+if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
+    BFLOAT16 = torch.cuda.is_bf16_supported(False)
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -550,6 +552,7 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
+        least = 0.001 if name == "init_std" else least
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:

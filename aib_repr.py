@@ -43,7 +43,9 @@ from tqdm import tqdm
 
 FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
+if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
+    BFLOAT16 = torch.cuda.is_bf16_supported(False)
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -317,7 +319,9 @@ def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
     num_val = round(args.num_episodes * args.val_share)
     if not 4 <= num_val < args.num_episodes:  # stage 2 needs two to choose weights and two for its report
-        fail(f"--val-share {args.val_share} of {args.num_episodes} holds out fewer than four episodes, or all; try 0.1")
+        fail(
+            f"--val-share {args.val_share} must hold out at least 4 of --num-episodes {args.num_episodes}, and not all"
+        )
     check_task(args)
     path, device = open_run(args), torch.device(args.device)
     if (path / "repr.pt").exists():
@@ -512,7 +516,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
     if args.mesh_triangles and args.sim_backend == "physx_cuda":
-        fail(f"--mesh-triangles {args.mesh_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
+        fail(f"meshes of {args.mesh_triangles} triangles need --sim-backend physx_cpu; 0 is for training on physx_cuda")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")
@@ -545,6 +549,7 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
+        least = 0.001 if name == "init_std" else least
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:

@@ -40,7 +40,9 @@ from tqdm import tqdm
 
 FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
+if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
+    BFLOAT16 = torch.cuda.is_bf16_supported(False)
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
@@ -495,7 +497,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
     if args.mesh_triangles and args.sim_backend == "physx_cuda":
-        fail(f"--mesh-triangles {args.mesh_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
+        fail(f"meshes of {args.mesh_triangles} triangles need --sim-backend physx_cpu; 0 is for training on physx_cuda")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")
@@ -528,6 +530,7 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
+        least = 0.001 if name == "init_std" else least
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:

@@ -122,7 +122,7 @@ def cell(reports: list[dict], key: str, steps: list[int]) -> str:
 
 def main(args: Args) -> None:
     """Run what is missing and print the table."""
-    reports, took = {row: [] for row in args.rows}, {}
+    reports, took = {row: [] for row in args.rows}, dict.fromkeys(args.rows, 0.0)
     for seed in args.seeds:
         base = ["--env-id", args.env_id, "--seed", str(seed), "--small"]
         run([str(ROOT / "aib_repr.py"), *base])
@@ -131,7 +131,7 @@ def main(args: Args) -> None:
             name = "ppo_believer_small" if row == "believer" else name
             script = ["-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}){BELIEVER}"]
             script = script if row == "believer" else [str(ROOT / "aib_belief.py")]
-            took[row] = run([*script, *base, "--exp-name", name, *ROWS[row]])
+            took[row] += run([*script, *base, "--exp-name", name, *ROWS[row]])
             path = Path("runs") / f"{args.env_id}__{name}__{seed}"
             reports[row].append(json.loads((path / "diagnostics.json").read_text()))
     first = reports[args.rows[0]]

@@ -39,7 +39,7 @@ def run(*command: str) -> None:
 
 def main(args: Args) -> None:
     """Run what is missing and print the read-outs."""
-    task, runs = ["--env-id", args.env_id], Path("runs")
+    task, runs = ["--env-id", args.env_id, "--sim-backend", "physx_cpu"], Path("runs")
     run("aib_belief.py", *task, "--small", "--mesh-triangles", "500")
     repr_dir = runs / f"{args.env_id}__aib_repr_small__1"
     for triangles in (500, 0):

@@ -215,7 +215,8 @@ def main(args: Args) -> None:
     if args.small:
         runs = {(task, name): found for (task, name), found in runs.items() if name.endswith("_small")}
     if not runs:
-        print(f"error: no eval.csv below {args.runs}; name the folder of run directories with --runs", file=sys.stderr)
+        kind = "eval.csv of a --small run" if args.small else "eval.csv"
+        print(f"error: no {kind} below {args.runs}; name the folder of run directories with --runs", file=sys.stderr)
         sys.exit(2)
     args.output.mkdir(parents=True, exist_ok=True)
     if args.small:

@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 ROOT = Path(__file__).parent.parent
 PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num_workers=3)
 SIZES = {
-    "aib_repr": dict(num_episodes=16, val_share=0.25, epochs=3, batch_size=30, num_workers=2),
+    "aib_repr": dict(num_episodes=12, val_share=0.34, epochs=3, batch_size=30, num_workers=2),
     "aib_belief": dict(num_updates=6, batch_episodes=4, held_out_every=2),
     "ppo_aib": dict(total_timesteps=240, **PPO),
     "ppo_believer": dict(total_timesteps=160, num_updates=4, batch_episodes=4, held_out_every=2, **PPO),
@@ -37,9 +37,9 @@ KILLS = [  # script, what it was doing, the moment
     ("aib_belief", "writing a checkpoint", "torch.save:2"),
     ("aib_belief", "stage 2, diagnostics", "diagnose_belief:1"),
     ("aib_belief", "renaming belief.pt", "os.replace:7"),
-    ("ppo_aib", "PPO, rollout", "env.step:45"),
+    ("ppo_aib", "PPO, evaluation", "env.step:45"),
     ("ppo_aib", "PPO, update", "ppo_losses:11"),
-    ("ppo_aib", "PPO, evaluation", "env.step:64"),
+    ("ppo_aib", "PPO, second rollout", "env.step:64"),
     ("ppo_aib", "PPO, making a video", "make_video:2"),
     ("ppo_aib", "PPO, writing agent.pt", "torch.save:3"),
     ("ppo_aib", "PPO, renaming eval.csv", "os.replace:6"),

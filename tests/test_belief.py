@@ -3,14 +3,19 @@
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 
 import aib_belief
 import aib_repr
-from conftest import ROOT, TOY
+import ppo_aib
+import ppo_believer
+from conftest import ROOT, TOY, train
 from per_step_loop import PerStepHistory
 
 
@@ -45,7 +50,7 @@ def make_stage_1(folder: Path, episodes: int) -> int:
 
 def test_peak_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path) -> None:
     peaks, sizes = [], []
-    for episodes in (560, 1600):  # both beyond the 512 training episodes that the diagnostics look at
+    for episodes in (560, 1600):
         folder = tmp_path / str(episodes)
         sizes.append(make_stage_1(folder, episodes))
         code = "import sys, aib_belief as b; b.main(b.Args(env_id=sys.argv[1], num_updates=3, batch_episodes=4))"
@@ -57,3 +62,38 @@ def test_peak_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path) -
         peaks.append(1024 * int(done.stdout.split("PEAK")[1]))
     print("images and peak memory in MB:", *(round(x / 1e6) for x in sizes + peaks))
     assert peaks[1] - peaks[0] < 0.25 * (sizes[1] - sizes[0])
+
+
+def test_one_half_of_the_held_out_episodes_chooses_the_weights_and_the_other_is_reported(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks, encode = [], aib_belief.encode
+
+    def recorded(belief: torch.nn.Module, *arguments: object) -> dict[str, torch.Tensor]:
+        seen = encode(belief, *arguments)
+        looks.append((arguments[-1].tolist(), {name: x.clone() for name, x in belief.state_dict().items()}))
+        if len(looks) == 3:
+            seen["particle"] = seen["u"]  # as if these were the best weights
+        return seen
+
+    monkeypatch.setattr(aib_belief, "encode", recorded)
+    repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
+    path = train(aib_belief, repr_dir=repr_dir, num_updates=6, batch_episodes=4, held_out_every=1)
+    choose, report = [15, 16, 17], [18, 19]  # of 20 episodes, a quarter of which is held out
+    assert [episodes for episodes, _ in looks] == [choose] * 6 + [choose, report]
+    stored = torch.load(path / "belief.pt", weights_only=True)["belief"]
+    assert all(torch.equal(stored[name], x) for name, x in looks[2][1].items())
+
+
+def test_an_earlier_stage_gets_what_it_needs_to_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = []
+    child = SimpleNamespace(wait=lambda: 0, send_signal=None)
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: commands.append(command) or child)
+    same = dict(env_id="RememberColor3-v0", seed=3, small=True, robot="panda", mesh_triangles=0, num_workers=5)
+    for module, script in ((aib_belief, "aib_repr.py"), (ppo_aib, "aib_belief.py"), (ppo_believer, "aib_repr.py")):
+        module.run_stage(script, module.Args(num_episodes=77, **same))
+        stage = {"aib_repr.py": aib_repr, "aib_belief.py": aib_belief}[script]
+        monkeypatch.setattr(sys, "argv", commands[-1][1:])
+        args = stage.parse_args({}, stage.SMALL, stage.QUICK)
+        assert {**same, "num_episodes": 77}.items() <= asdict(args).items()
+        assert args.exp_name == f"{script.removesuffix('.py')}_small"

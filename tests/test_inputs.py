@@ -52,7 +52,7 @@ def test_no_rendering_device(tmp_path: Path) -> None:
 def test_light_meshes_only_where_there_is_one_scene_per_process(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit) as stop:
         ppo_aib.check_task(ppo_aib.Args(sim_backend="physx_cuda", mesh_triangles=500))
-    refused((stop.value.code, *capsys.readouterr()), "--mesh-triangles 500", "physx_cpu")
+    refused((stop.value.code, *capsys.readouterr()), "meshes of 500 triangles", "physx_cpu")
 
 
 def test_a_folder_that_cannot_be_written() -> None:
@@ -68,6 +68,7 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_aib", ["--learning-rate", "nan"], ["--learning-rate nan"]),
         ("ppo_believer", ["--eval-every", "0"], ["--eval-every 0"]),
         ("ppo_baseline", ["--seed", "-1"], ["--seed -1"]),
+        ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
         ("ppo_baseline", ["--device", "cuda"], ["no CUDA device", "--device cpu"]),
     ],
 )
@@ -117,13 +118,22 @@ def code_in(path: Path) -> Callable[[], object]:
     return lambda: torch.save({"format": aib_repr.FORMAT, "kind": "aib_belief", "x": Payload()}, path)
 
 
+def other_dataset() -> None:
+    """A dataset of another format, on which stage 1 has still to be trained."""
+    REPR_PT.unlink()
+    meta = json.loads((DATA / "meta.json").read_text())
+    (DATA / "meta.json").write_text(json.dumps({**meta, "format": 9}))
+
+
+STAGE_1 = dict(num_episodes=20, val_share=0.25, epochs=1, batch_size=50)
 STAGE_2 = dict(exp_name="again", num_updates=1)
 PPO = dict(num_envs=4, total_timesteps=40, num_eval_episodes=4, num_minibatches=2)
 ONLY_EVALUATE = dict(evaluate=True, num_envs=4, num_eval_episodes=4, checkpoint=str(AGENT))
 CASES = {  # name: (script, arguments, damage, words of the sentence)
-    "nothing held out": (aib_repr, dict(val_share=0.0), None, ["--val-share 0.0", "try 0.1"]),
+    "nothing held out": (aib_repr, dict(val_share=0.0), None, ["--val-share 0.0", "--num-episodes"]),
     "all held out": (aib_repr, dict(val_share=1.0), None, ["--val-share 1.0"]),
     "no disk for it": (aib_repr, dict(exp_name="big", num_episodes=10**10), None, ["has free", "--num-episodes"]),
+    "dataset of another format": (aib_repr, STAGE_1, other_dataset, ["has format 9", "--overwrite"]),
     "repr.pt cut short": (aib_belief, STAGE_2, cut(REPR_PT), ["repr.pt is missing, damaged", "--overwrite"]),
     "repr.pt empty": (aib_belief, STAGE_2, write(REPR_PT, b""), ["repr.pt is missing, damaged"]),
     "repr.pt from the future": (aib_belief, STAGE_2, change(REPR_PT, format=9), ["repr.pt has format 9"]),

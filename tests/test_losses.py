@@ -44,7 +44,7 @@ def belief_batch(steps: int = T) -> dict[str, torch.Tensor]:
 
 
 def losses_args(**changes: object) -> SimpleNamespace:
-    defaults = dict(bptt_steps=None, beta=1.0, action_head="flow", fm_latent="sample", action_lambda=1.0)
+    defaults = dict(bptt_steps=None, beta=1.0, action_head="flow", fm_latent="mean", action_lambda=1.0)
     return SimpleNamespace(**{**defaults, **changes})
 
 
@@ -138,6 +138,20 @@ def test_total_loss_adds_up_and_ablations_leave_their_term_out() -> None:
         assert losses.keys() == terms | {"total"}
         total = losses["nll"] + 0.5 * losses["kl"] + 0.1 * losses.get("action", 0)
         assert torch.allclose(losses["total"], total)
+
+
+@pytest.mark.parametrize("latent", ["mean", "sample"])
+def test_what_the_action_head_sees_of_the_posterior(latent: str) -> None:
+    model, batch = belief_model(), belief_batch()
+    torch.manual_seed(2)
+    loss = aib_belief.belief_losses(model, batch, losses_args(fm_latent=latent))["action"]
+    torch.manual_seed(2)
+    q = model["posterior"](torch.cat([batch["u"], model["belief"].history(batch)[0]], -1))
+    sample, action = q.rsample(), batch["actions"]
+    z = {"mean": q.mean, "sample": sample}[latent]
+    noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
+    expected = aib_belief.flow_matching_loss(model["head"], action, z[:-1], z[1:], noise, tau).mean()
+    assert torch.allclose(loss, expected)
 
 
 def test_flow_loss_shapes_the_posterior_and_the_prior_only_through_the_kl() -> None:
@@ -263,11 +277,14 @@ def test_chrono_initialisation_sets_the_update_gate() -> None:
     assert kept.mean() > 0.85
 
 
-def test_the_belief_keeps_the_training_episodes_mean_image(toy_stages: Path) -> None:
+def test_the_belief_keeps_the_training_episodes_mean_image_and_joints(toy_stages: Path) -> None:
     rgb = np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "rgb.npy")[:15, ::8].astype(float)
     history = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)["belief"]
     assert torch.allclose(history["history.image_mean"].double(), torch.from_numpy(rgb.mean((0, 1))), atol=1e-3)
     assert abs(history["history.image_std"].item() - (rgb - rgb.mean((0, 1))).std()) < 1e-3
+    joints = torch.from_numpy(np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "joints.npy")[:15]).flatten(0, 1)
+    assert torch.allclose(history["history.joints_mean"], joints.mean(0), atol=1e-4)
+    assert torch.allclose(history["history.joints_std"], joints.std(0, correction=0), atol=1e-4)
 
 
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:

@@ -1,6 +1,7 @@
 """Stage 3 and the baselines on the toy task: what an iteration is made of, and that it depends on nothing else."""
 
 import csv
+import math
 import sys
 import weakref
 from pathlib import Path
@@ -141,6 +142,17 @@ def test_any_number_of_workers_gives_the_same_training_and_evaluation(
         for row, other_row in zip(one[1], other[1], strict=True):
             assert row.keys() == other_row.keys()
             assert all(float(row[name]) == pytest.approx(float(other_row[name]), abs=1e-4) for name in row)
+
+
+def test_evaluate_takes_over_what_the_episodes_depend_on(toy_task: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = train(ppo_baseline, **SMALL, init_std=0.2) / "agent.pt"
+    stored = torch.load(agent, weights_only=True)["agent"]
+    assert (stored["log_std"] - math.log(0.2)).abs().max() < 0.05, "it has been trained a little"
+    seen = []
+    monkeypatch.setattr(ppo_baseline, "make_envs", lambda args: seen.append(args) or toy.make_envs(args))
+    options = dict(evaluate=True, checkpoint=str(agent), num_eval_episodes=4, num_workers=2)
+    ppo_baseline.main(ppo_baseline.Args(num_envs=3, amp=True, **options))
+    assert (seen[0].env_id, seen[0].num_envs, seen[0].amp) == (TOY, SMALL["num_envs"], False)
 
 
 def test_orthogonal_initialisation() -> None:
