@@ -83,7 +83,7 @@ class Args:
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; any number gives the same results"""
     small: bool = False
-    """smaller than the paper, for a few CPU cores and hours; found on RememberColor3-v0"""
+    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
