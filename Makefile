@@ -26,10 +26,10 @@ demo: setup
 test: setup
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
-	$(PY) -m pytest --numprocesses auto --dist loadgroup -m "not thorough"
+	$(PY) -m pytest --numprocesses auto --dist loadfile -m "not thorough"
 
 test-all: setup
-	$(PY) -m pytest --numprocesses auto --dist loadgroup
+	$(PY) -m pytest --numprocesses auto --dist loadfile
 
 bench: setup
 	$(PY) -m pip install --quiet --no-deps colorama  # MIKASA-Robo's own PPO script wants it

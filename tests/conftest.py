@@ -18,8 +18,6 @@ import toy
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {module.__name__: module for module in (aib_repr, aib_belief, ppo_aib, ppo_believer, ppo_baseline)}
-# where tests run in several processes, those that share a slow fixture go to the same one
-SHARES_QUICK_RUNS, SHARES_REFERENCE = pytest.mark.xdist_group("quick_runs"), pytest.mark.xdist_group("reference")
 TASK, TOY = "RememberColor9-v0", "ToyMemory-v0"
 os.environ["TQDM_MININTERVAL"] = "30"
 if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each process

@@ -82,7 +82,9 @@ def curves(folder: Path) -> dict[str, list]:
     """TensorBoard's curves as (step, value), without those that measure time; each step must be there once."""
     events = EventAccumulator(str(folder)).Reload()
     tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(("time/", "charts/"))]
-    return {tag: [(row.step, row.value) for row in events.Scalars(tag)] for tag in tags}
+    return {
+        tag: [(row.step, repr(row.value)) for row in events.Scalars(tag)] for tag in tags
+    }  # nan too is equal to nan
 
 
 def readable(folder: Path) -> bool:
