@@ -138,7 +138,8 @@ def cell(runs: list[Run] | None, column: str, which: str) -> str:
     if not runs:
         return "missing"
     done = [statistic(run, column, which) for run in runs if run.finished and not run.quick]
-    notes = [f"seed {run.seed} unfinished ({run.share:.0%})" for run in runs if not run.finished]
+    going = [run for run in runs if not run.finished]
+    notes = [f"seed {run.seed} unfinished ({run.share:.0%}): {statistic(run, column, which):.2f}" for run in going]
     notes += [f"seed {run.seed} is a --quick trial" for run in runs if run.finished and run.quick]
     return "; ".join(([summarise(done)] if done else []) + notes)
 

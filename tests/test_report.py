@@ -28,7 +28,7 @@ def test_tables_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     # last three: 0.6, 0.5, 0.8: mean 0.6333, sample deviation 0.1528; interquartile mean weighs them 1/6, 4/6, 1/6
     assert "| 0.63 ± 0.15 (3 seeds), IQM 0.62 [0.50, 0.80] | 0.82 ± 0.04 |" in row
     assert "| 0.50 (1 seed) | 0.76 ± 0.02 |" in row
-    assert "| seed 1 unfinished (33%) | 0.04 ± 0.02 |" in row
+    assert "| seed 1 unfinished (33%): 0.05 | 0.04 ± 0.02 |" in row
     assert next(line for line in tables["Table 1"] if line.startswith("| RC9")).count("missing") == 3
     row = next(line for line in tables["Table 6"] if line.startswith("| RSC3x2"))
     assert "| 0.41 ± 0.16 (3 seeds)" in row  # 1/3, 0.3, 0.6: mean 0.4111, deviation 0.1644
