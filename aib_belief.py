@@ -43,7 +43,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
-FRAMES = 2048  # images through a belief's CNN at a time: their activations take some 2 GB
+FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
@@ -611,8 +611,8 @@ def run_stage(script: str, args: Args) -> None:
     """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
     command = [sys.executable, str(Path(__file__).with_name(script))]
     command += ["--small"] * args.small + ["--quick"] * args.quick
-    same = ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers")
-    for name in (*same, "num_episodes"):
+    task = ("env_id", "seed", "robot", "mesh_triangles", "num_episodes")
+    for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
     # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it

@@ -55,7 +55,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
-FRAMES = 2048  # images through a belief's CNN at a time: their activations take some 2 GB
+FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
@@ -791,8 +791,7 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,), cue (B, K), the memory variable itself, and state (B, D), which has the cue and all
-    else that cannot be observed.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
     """
 
     def __init__(self, env: gym.Env):
@@ -897,9 +896,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
-    os.environ["PYTHONPATH"] = os.pathsep.join(
-        sys.path
-    )  # else the process they are forked from cannot import this file
+    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])
@@ -1005,8 +1002,8 @@ def run_stage(script: str, args: Args) -> None:
     """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
     command = [sys.executable, str(Path(__file__).with_name(script))]
     command += ["--small"] * args.small + ["--quick"] * args.quick
-    same = ("env_id", "seed", "device", "sim_backend", "render_backend", "robot", "mesh_triangles", "num_workers")
-    for name in (*same, "num_episodes"):
+    task = ("env_id", "seed", "robot", "mesh_triangles", "num_episodes")
+    for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
     # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it
