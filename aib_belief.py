@@ -422,7 +422,7 @@ def plot_diagnostics(report: dict, title: str) -> bytes:
     """Draw the report as a PNG: the cue's read-out and the reconstruction of u against time."""
     matplotlib.use("Agg")
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
-    left.plot(report["cue_from_u"], "k:", label="from u (ceiling)")
+    left.plot(report["cue_from_u"], "k:", label="from u itself")
     left.plot(report["cue_from_h"], "C0-", label="from h")
     left.plot(report["cue_from_particle"], "C1--", label="from the mean particle")
     left.axhline(report["cue_chance"], color="grey", linestyle="-.", label="chance")

@@ -319,9 +319,7 @@ def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
     num_val = round(args.num_episodes * args.val_share)
     if not 4 <= num_val < args.num_episodes:  # stage 2 needs two to choose weights and two for its report
-        fail(
-            f"--val-share {args.val_share} must hold out at least 4 of --num-episodes {args.num_episodes}, and not all"
-        )
+        fail(f"--val-share {args.val_share} must hold out 4 or more of --num-episodes {args.num_episodes}, and not all")
     check_task(args)
     path, device = open_run(args), torch.device(args.device)
     if (path / "repr.pt").exists():
@@ -440,8 +438,7 @@ def light_shaders() -> Iterator[None]:
             lines = [line for line in file.read_text().splitlines() if "sampler2D samplerBRDFLUT;" not in line]
             text = "\n".join(lines).replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)")
             file.write_text(text)
-        if not any("samplerBRDFLUT" in file.read_text() for file in Path(pack).iterdir()):  # else they are not ours
-            sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
+        sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
         yield
         sapien.render.set_camera_shader_dir = set_shader_dir
 

@@ -422,11 +422,10 @@ def evaluate_with_belief(envs: gym.Env, agent: BeliefAgent, args: Args, known: d
 
 def main(args: Args) -> None:
     """Train an agent that acts on observation and belief, or with --evaluate only evaluate one."""
-    settings = ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise")
     if args.evaluate:
         file = Path(args.checkpoint.format(**vars(args)))
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
-        for name in settings:
+        for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
             setattr(args, name, stored[name])
     check_task(args)
     path = file.parent if args.evaluate else open_run(args)
@@ -575,8 +574,7 @@ def light_shaders() -> Iterator[None]:
             lines = [line for line in file.read_text().splitlines() if "sampler2D samplerBRDFLUT;" not in line]
             text = "\n".join(lines).replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)")
             file.write_text(text)
-        if not any("samplerBRDFLUT" in file.read_text() for file in Path(pack).iterdir()):  # else they are not ours
-            sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
+        sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
         yield
         sapien.render.set_camera_shader_dir = set_shader_dir
 

@@ -279,11 +279,10 @@ def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args) -> tuple[dict
 
 def main(args: Args) -> None:
     """Train an agent that acts on the present observation alone, or with --evaluate only evaluate one."""
-    settings = ("env_id", "robot", "mesh_triangles", "num_envs", "amp")  # agent.pt keeps them
     if args.evaluate:
         file = Path(args.checkpoint.format(**vars(args)))
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_baseline agent")
-        for name in settings:
+        for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp"):
             setattr(args, name, stored[name])
     check_task(args)
     path = file.parent if args.evaluate else open_run(args)
@@ -421,8 +420,7 @@ def light_shaders() -> Iterator[None]:
             lines = [line for line in file.read_text().splitlines() if "sampler2D samplerBRDFLUT;" not in line]
             text = "\n".join(lines).replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)")
             file.write_text(text)
-        if not any("samplerBRDFLUT" in file.read_text() for file in Path(pack).iterdir()):  # else they are not ours
-            sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
+        sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
         yield
         sapien.render.set_camera_shader_dir = set_shader_dir
 

@@ -553,7 +553,7 @@ def plot_diagnostics(report: dict, title: str) -> bytes:
     """Draw the report as a PNG: the cue's read-out and the reconstruction of u against time."""
     matplotlib.use("Agg")
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
-    left.plot(report["cue_from_u"], "k:", label="from u (ceiling)")
+    left.plot(report["cue_from_u"], "k:", label="from u itself")
     left.plot(report["cue_from_h"], "C0-", label="from h")
     left.plot(report["cue_from_particle"], "C1--", label="from the mean particle")
     left.axhline(report["cue_chance"], color="grey", linestyle="-.", label="chance")
@@ -686,11 +686,10 @@ def train_belief(args: Args, path: Path) -> None:
 
 def main(args: Args) -> None:
     """Train belief and agent of the Believer baseline, or with --evaluate only evaluate an agent."""
-    settings = ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise")
     if args.evaluate:
         file = Path(args.checkpoint.format(**vars(args)))
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_believer agent")
-        for name in settings:
+        for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
             setattr(args, name, stored[name])
     check_task(args)
     path = file.parent if args.evaluate else open_run(args)
@@ -837,8 +836,7 @@ def light_shaders() -> Iterator[None]:
             lines = [line for line in file.read_text().splitlines() if "sampler2D samplerBRDFLUT;" not in line]
             text = "\n".join(lines).replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)")
             file.write_text(text)
-        if not any("samplerBRDFLUT" in file.read_text() for file in Path(pack).iterdir()):  # else they are not ours
-            sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
+        sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
         yield
         sapien.render.set_camera_shader_dir = set_shader_dir
 
