@@ -12,7 +12,6 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, diagno
 """
 
 import argparse
-import copy
 import ctypes
 import fcntl
 import io
@@ -116,7 +115,7 @@ class Args:
     belief_amp: bool = BFLOAT16
     """convolutions in bfloat16 while the belief is trained"""
     held_out_every: int = 50
-    """updates between looks at the held-out episodes; the best weights are kept"""
+    """updates between checkpoints, each with a look at held-out episodes"""
 
 
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
@@ -442,14 +441,14 @@ def plot_diagnostics(report: dict, title: str) -> bytes:
 
 
 def main(args: Args) -> None:
-    """Train the belief on whole episodes, keep the weights best on held-out ones, report what it remembers."""
+    """Train the belief on whole episodes, report what it remembers of held-out ones."""
     path, device = open_run(args), torch.device(args.device)
     if (path / "belief.pt").exists():
         print(f"{path / 'belief.pt'} is finished; --overwrite makes it anew")
         return
     episodes, stored = load_episodes(args)
-    # half of the held-out episodes choose the weights, the other half is for the report
-    train, choose, report_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
+    # of the held-out episodes, read-outs are fitted on one half and tested on the other
+    train, fit_on, test_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers}
@@ -477,12 +476,12 @@ def main(args: Args) -> None:
     ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: an update is a third faster on a CPU
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
-    first, best_error, best = 0, math.inf, None
+    first = 0
     if (path / "checkpoint.pt").exists():
         checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first, best_error, best = checkpoint["update"], checkpoint["best_error"], checkpoint["best"]
+        first = checkpoint["update"]
         print(f"going on with {path} at update {first}", flush=True)
     writer = SummaryWriter(path, purge_step=first + 1)
     bar = tqdm(total=args.num_updates, initial=first, desc="belief", unit="update")
@@ -502,22 +501,19 @@ def main(args: Args) -> None:
                 writer.add_scalar(f"belief/{name}", value, update)
 
         if update % args.held_out_every == 0 or update == args.num_updates:
-            held_out = encode(model["belief"], model["posterior"], episodes, choose)
+            held_out = encode(model["belief"], model["posterior"], episodes, test_on)
             error = (held_out["u"] - held_out["particle"]).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
             writer.add_scalar("belief/held_out_nll_prior", held_out["nll_prior"].mean(), update)
             writer.add_scalar("belief/held_out_nll_posterior", held_out["nll_posterior"].mean(), update)
             bar.set_postfix(held_out_error=f"{error:.3f}")
-            if error < best_error:  # of the mean particle, which is what PPO gets
-                best_error, best = error, copy.deepcopy(model.state_dict())
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            checkpoint |= {"best_error": best_error, "best": best}
             save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
-    model.load_state_dict(best)
-    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (choose, report_on))
+    # the last weights: held-out error and likelihood are best before the belief remembers
+    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = diagnose_belief(fit, test)
     cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)  # for eval/cue_readout of PPO
     known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}

@@ -318,7 +318,7 @@ def diagnose_repr(phi: StateEncoder, state: torch.Tensor, cue: torch.Tensor, num
 def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
     num_val = round(args.num_episodes * args.val_share)
-    if not 4 <= num_val < args.num_episodes:  # stage 2 needs two to choose weights and two for its report
+    if not 4 <= num_val < args.num_episodes:  # stage 2 fits read-outs on half of them and tests them on the other
         fail(f"--val-share {args.val_share} must hold out 4 or more of --num-episodes {args.num_episodes}, and not all")
     check_task(args)
     path, device = open_run(args), torch.device(args.device)

@@ -11,7 +11,6 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, diagno
 """
 
 import argparse
-import copy
 import ctypes
 import fcntl
 import io
@@ -123,7 +122,7 @@ class Args:
     belief_amp: bool = BFLOAT16
     """convolutions in bfloat16 while the belief is trained"""
     held_out_every: int = 50
-    """updates between looks at the held-out episodes; the best weights are kept"""
+    """updates between checkpoints, each with a look at held-out episodes"""
 
     num_particles: int = 30
     """particles drawn from the belief at every step"""
@@ -608,8 +607,8 @@ def train_belief(args: Args, path: Path) -> None:
     """Train Believer's belief on stage 1's output as aib_belief.py does; writes belief.pt and diagnostics into path."""
     device = torch.device(args.device)
     episodes, stored = load_episodes(args)
-    # half of the held-out episodes choose the weights, the other half is for the report
-    train, choose, report_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
+    # of the held-out episodes, read-outs are fitted on one half and tested on the other
+    train, fit_on, test_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers}
@@ -634,12 +633,12 @@ def train_belief(args: Args, path: Path) -> None:
     ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: an update is a third faster on a CPU
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
-    first, best_error, best = 0, math.inf, None
+    first = 0
     if (path / "belief_checkpoint.pt").exists():
         checkpoint = load(path / "belief_checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first, best_error, best = checkpoint["update"], checkpoint["best_error"], checkpoint["best"]
+        first = checkpoint["update"]
         print(f"going on with {path} at update {first}", flush=True)
     writer = SummaryWriter(path / "belief_events", purge_step=first + 1)
     bar = tqdm(total=args.num_updates, initial=first, desc="belief", unit="update")
@@ -659,22 +658,19 @@ def train_belief(args: Args, path: Path) -> None:
                 writer.add_scalar(f"belief/{name}", value, update)
 
         if update % args.held_out_every == 0 or update == args.num_updates:
-            held_out = encode(model["belief"], model["posterior"], episodes, choose)
+            held_out = encode(model["belief"], model["posterior"], episodes, test_on)
             error = (held_out["u"] - held_out["particle"]).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
             writer.add_scalar("belief/held_out_nll_prior", held_out["nll_prior"].mean(), update)
             writer.add_scalar("belief/held_out_nll_posterior", held_out["nll_posterior"].mean(), update)
             bar.set_postfix(held_out_error=f"{error:.3f}")
-            if error < best_error:  # of the mean particle, which is what PPO gets
-                best_error, best = error, copy.deepcopy(model.state_dict())
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            checkpoint |= {"best_error": best_error, "best": best}
             save(path / "belief_checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
-    model.load_state_dict(best)
-    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (choose, report_on))
+    # the last weights: held-out error and likelihood are best before the belief remembers
+    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = diagnose_belief(fit, test)
     cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)  # for eval/cue_readout of PPO
     known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
