@@ -18,7 +18,7 @@ run: setup
 	$(PY) ppo_aib.py --env-id InterceptFast-v0 $$quick
 
 demo: setup
-	echo "AIB on RememberColor3-v0 with --small: 2 to 2.5 hours on one CPU core; stopped, make demo goes on with it"
+	echo "AIB on RememberColor3-v0 with --small: about 2 hours on one CPU core; stopped, make demo goes on with it"
 	$(PY) ppo_aib.py --env-id RememberColor3-v0 --small
 	$(PY) benchmark/report.py --small
 	echo "curve: benchmark/report/small.png; videos: $$(ls -d runs/RememberColor3-v0__ppo_aib_small__1/videos)"

@@ -205,7 +205,7 @@ def finish(figure: plt.Figure, axes: np.ndarray, column: str, path: Path) -> Non
         if not any(len(line.get_xdata()) for line in ax.lines):
             ax.set_xticks([])  # no runs, no scale
         ax.grid(alpha=0.3)
-        ax.legend(fontsize=8)
+        ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
