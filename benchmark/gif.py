@@ -1,6 +1,6 @@
 """A small GIF of an evaluation video, for a README: every other frame at half the size, cubes in their colours.
 
-Usage:   python benchmark/gif.py runs/RememberColor3-v0__ppo_aib_small__1/videos/step_00086400.mp4 agent.gif
+Usage:   python benchmark/gif.py runs/RememberColor3-v0__ppo_aib_small__1/videos/step_00240000.mp4 agent.gif
 """
 
 import sys
