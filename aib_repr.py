@@ -1,7 +1,7 @@
 """AIB stage 1: a random-policy dataset and a compact encoder of the privileged state (paper section 3.1, Algorithm 1).
 
 phi(s) is trained with psi(o) to predict reward and next latents, and pays by its KL for what it carries: it is left
-with what matters and cannot be seen. Only phi is kept.
+with what matters and cannot be seen. Of psi, later stages use only how it standardises images and joints.
 
 Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, diagnostics.json, TensorBoard events
@@ -41,7 +41,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
@@ -178,16 +178,16 @@ class ObservationEncoder(nn.Module):
 
     def __init__(self, image_shape: list[int], joints_dim: int, u_dim: int, amp: bool = False):
         super().__init__()
-        self.register_buffer("mean", torch.zeros(joints_dim))
-        self.register_buffer("std", torch.ones(joints_dim))
         self.register_buffer("image_mean", torch.zeros(image_shape))
         self.register_buffer("image_std", torch.tensor(255.0))
+        self.register_buffer("joints_mean", torch.zeros(joints_dim))
+        self.register_buffer("joints_std", torch.ones(joints_dim))
         self.cnn = orthogonal_init(NatureCNN(image_shape, 256, amp))
         self.net = GaussianMLP(256 + joints_dim, [256, 256], u_dim, min_std=1e-5)
 
     def forward(self, rgb: torch.Tensor, joints: torch.Tensor) -> Normal:
         image = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
-        return self.net(torch.cat([image, (joints - self.mean) / self.std], -1))
+        return self.net(torch.cat([image, (joints - self.joints_mean) / self.joints_std], -1))
 
 
 class Predictor(nn.Module):
@@ -334,10 +334,10 @@ def main(args: Args) -> None:
     phi = StateEncoder(arrays["state"].shape[-1], args.u_dim)
     psi = ObservationEncoder(list(arrays["rgb"].shape[2:]), arrays["joints"].shape[-1], args.u_dim, args.amp)
     g = Predictor(args.u_dim, action_dim)
-    for encoder, x in ((phi, train["state"]), (psi, train["joints"])):
-        encoder.mean.copy_(torch.from_numpy(x.mean((0, 1), dtype=np.float64)))
+    for mean, std, x in ((phi.mean, phi.std, train["state"]), (psi.joints_mean, psi.joints_std, train["joints"])):
+        mean.copy_(torch.from_numpy(x.mean((0, 1), dtype=np.float64)))
         # the floor keeps a centimetre of jitter from counting as much as the whole table
-        encoder.std.copy_(torch.from_numpy(x.std((0, 1), dtype=np.float64).clip(0.05)))
+        std.copy_(torch.from_numpy(x.std((0, 1), dtype=np.float64).clip(0.05)))
     frames = np.array(train["rgb"][:128, ::8], np.float32)  # a sample that fits into memory
     psi.image_mean = torch.from_numpy(frames.mean((0, 1)))
     psi.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
@@ -381,7 +381,8 @@ def main(args: Args) -> None:
 
     report = diagnose_repr(phi.cpu(), torch.from_numpy(arrays["state"]), torch.from_numpy(arrays["cue"]), num_val)
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
-    save(path / "repr.pt", {"kind": "repr", **asdict(args), "num_val": num_val, "phi": phi.state_dict()})
+    content = {"kind": "repr", **asdict(args), "num_val": num_val}
+    save(path / "repr.pt", {**content, "phi": phi.state_dict(), "psi": psi.state_dict()})
     print(f"{path / 'repr.pt'}: " + ", ".join(f"{name} {value:.3g}" for name, value in report.items()))
 
 

@@ -49,7 +49,7 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
@@ -194,7 +194,7 @@ class NatureCNN(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the history o_0, a_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
+    """h_t of the history o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
@@ -202,9 +202,8 @@ class HistoryEncoder(nn.Module):
         self.register_buffer("image_std", torch.tensor(255.0))
         self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
-        # beside the image, joints and previous actions, where their sizes are not 0
-        self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
-        inputs = 512 + config["joints_dim"] + config["action_dim"]
+        self.use_joints = config["joints_dim"] > 0
+        inputs = 512 + config["joints_dim"]
         self.cnn = orthogonal_init(NatureCNN(config["image_shape"], 512, amp))
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
@@ -218,7 +217,7 @@ class HistoryEncoder(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Encode T steps of B histories that go on from memory, the GRU's state: -> h (T, B, 256), memory.
 
-        batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J), previous (T, B, A), the action before each observation.
+        batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
         All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in
         chunks that the backward pass computes once more. T = 1 is the step path of PPO.
         """
@@ -228,8 +227,6 @@ class HistoryEncoder(nn.Module):
         x = x.view(*batch["rgb"].shape[:2], -1)
         if self.use_joints:
             x = torch.cat([x, (batch["joints"] - self.joints_mean) / self.joints_std], -1)
-        if self.use_actions:
-            x = torch.cat([x, batch["previous"]], -1)
         outputs = []
         for chunk in x.split(bptt_steps or len(x)):
             output, memory = self.gru(chunk, None if memory is None else memory.detach())
@@ -281,7 +278,7 @@ class BeliefAgent(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Take in one observation (B, ...) and draw u_i ~ p(u|z_i,h), z_i ~ p(z|h): -> (B, n, u_dim), memory.
 
-        obs: rgb, joints, previous; noise (B, n, .); memory: the history encoder's, None at the start of an episode.
+        obs: rgb, joints; noise (B, n, .); memory: the history encoder's, None at the start of an episode.
         """
         h, memory = self.belief.history({name: x[None] for name, x in obs.items()}, memory)
         decoded = self.belief.decode(h[0], z_noise)
@@ -344,18 +341,17 @@ def rollout_with_belief(
         now = slice(first, min(first + envs.num_envs, count))  # the episodes of this round
         playing = now.stop - now.start  # in the last round some environments may only repeat what others do
         obs, start = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
-        memory, previous = None, torch.zeros(playing, action_dim, device=device)
+        memory = None
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name][:playing], device=device) for name in ("rgb", "joints")}
-            seen = {**step, "previous": previous}
-            step["particles"], memory = agent.draw_particles(seen, memory, z_noise[t, now], u_noise[t, now])
+            step["particles"], memory = agent.draw_particles(step, memory, z_noise[t, now], u_noise[t, now])
             policy, data["value"][t, now] = agent(step)
             if t == steps:
                 break  # the last observation is only for its value
             step["action"] = policy.mean + policy.stddev * noise[t, now]
             step["logprob"] = policy.log_prob(step["action"]).sum(-1)
-            previous = step["action"].clamp(-1, 1)
-            obs, reward, _, _, info = envs.step(np.resize(previous.cpu().numpy(), (envs.num_envs, action_dim)))
+            action = step["action"].clamp(-1, 1).cpu().numpy()
+            obs, reward, _, _, info = envs.step(np.resize(action, (envs.num_envs, action_dim)))
             for name, x in (("reward", reward), ("success", info["success"]), ("cue", start["cue"])):
                 step[name] = torch.as_tensor(x[:playing], dtype=torch.float32, device=device)
             for name, x in step.items():

@@ -38,7 +38,7 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each

@@ -53,7 +53,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 3  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
@@ -117,8 +117,6 @@ class Args:
     """layers of the GRU"""
     history_joints: bool = True
     """joints in the history, as in the paper; its authors' code has the image alone"""
-    history_actions: bool = False
-    """previous actions in the history; then z can carry them with no regard for the world"""
     belief_amp: bool = BFLOAT16
     """convolutions in bfloat16 while the belief is trained"""
     held_out_every: int = 50
@@ -239,7 +237,7 @@ class StateEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the history o_0, a_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
+    """h_t of the history o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
@@ -247,9 +245,8 @@ class HistoryEncoder(nn.Module):
         self.register_buffer("image_std", torch.tensor(255.0))
         self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
-        # beside the image, joints and previous actions, where their sizes are not 0
-        self.use_joints, self.use_actions = config["joints_dim"] > 0, config["action_dim"] > 0
-        inputs = 512 + config["joints_dim"] + config["action_dim"]
+        self.use_joints = config["joints_dim"] > 0
+        inputs = 512 + config["joints_dim"]
         self.cnn = orthogonal_init(NatureCNN(config["image_shape"], 512, amp))
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
@@ -263,7 +260,7 @@ class HistoryEncoder(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Encode T steps of B histories that go on from memory, the GRU's state: -> h (T, B, 256), memory.
 
-        batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J), previous (T, B, A), the action before each observation.
+        batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
         All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in
         chunks that the backward pass computes once more. T = 1 is the step path of PPO.
         """
@@ -273,8 +270,6 @@ class HistoryEncoder(nn.Module):
         x = x.view(*batch["rgb"].shape[:2], -1)
         if self.use_joints:
             x = torch.cat([x, (batch["joints"] - self.joints_mean) / self.joints_std], -1)
-        if self.use_actions:
-            x = torch.cat([x, batch["previous"]], -1)
         outputs = []
         for chunk in x.split(bptt_steps or len(x)):
             output, memory = self.gru(chunk, None if memory is None else memory.detach())
@@ -337,7 +332,7 @@ class BeliefAgent(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Take in one observation (B, ...) and draw u_i ~ p(u|z_i,h), z_i ~ p(z|h): -> (B, n, u_dim), memory.
 
-        obs: rgb, joints, previous; noise (B, n, .); memory: the history encoder's, None at the start of an episode.
+        obs: rgb, joints; noise (B, n, .); memory: the history encoder's, None at the start of an episode.
         """
         h, memory = self.belief.history({name: x[None] for name, x in obs.items()}, memory)
         decoded = self.belief.decode(h[0], z_noise)
@@ -406,7 +401,7 @@ class Episodes:
                 self.rgb[i] = torch.from_numpy(rgb[i])
 
     def __call__(self, index: np.ndarray) -> dict[str, torch.Tensor]:
-        """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u, previous (T+1, B, .), actions (T, B, A), cue (B, K).
+        """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K).
 
         The maps are opened anew each time, so that pages once read do not stay in this process.
         """
@@ -416,7 +411,7 @@ class Episodes:
             batch["rgb"] = self.rgb[torch.from_numpy(index).to(self.device)]
         batch["u"] = self.u[index]
         batch = {name: x.to(self.device).transpose(0, 1) for name, x in batch.items()}
-        return {**batch, "previous": nn.functional.pad(batch["actions"], (0, 0, 0, 0, 1, 0)), "cue": self.cue[index]}
+        return {**batch, "cue": self.cue[index]}
 
 
 def load_episodes(args: Args) -> tuple[Episodes, dict]:
@@ -460,18 +455,17 @@ def rollout_with_belief(
         now = slice(first, min(first + envs.num_envs, count))  # the episodes of this round
         playing = now.stop - now.start  # in the last round some environments may only repeat what others do
         obs, start = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
-        memory, previous = None, torch.zeros(playing, action_dim, device=device)
+        memory = None
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name][:playing], device=device) for name in ("rgb", "joints")}
-            seen = {**step, "previous": previous}
-            step["particles"], memory = agent.draw_particles(seen, memory, z_noise[t, now], u_noise[t, now])
+            step["particles"], memory = agent.draw_particles(step, memory, z_noise[t, now], u_noise[t, now])
             policy, data["value"][t, now] = agent(step)
             if t == steps:
                 break  # the last observation is only for its value
             step["action"] = policy.mean + policy.stddev * noise[t, now]
             step["logprob"] = policy.log_prob(step["action"]).sum(-1)
-            previous = step["action"].clamp(-1, 1)
-            obs, reward, _, _, info = envs.step(np.resize(previous.cpu().numpy(), (envs.num_envs, action_dim)))
+            action = step["action"].clamp(-1, 1).cpu().numpy()
+            obs, reward, _, _, info = envs.step(np.resize(action, (envs.num_envs, action_dim)))
             for name, x in (("reward", reward), ("success", info["success"]), ("cue", start["cue"])):
                 step[name] = torch.as_tensor(x[:playing], dtype=torch.float32, device=device)
             for name, x in step.items():
@@ -610,10 +604,8 @@ def train_belief(args: Args, path: Path) -> None:
     # of the held-out episodes, read-outs are fitted on one half and tested on the other
     train, fit_on, test_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
     sample = episodes(train[:1])
-    action_dim = sample["actions"].shape[-1]
-    config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers}
+    config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
     config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints, "u_dim": stored["u_dim"]}
-    config |= {"action_dim": action_dim * args.history_actions, "z_dim": args.z_dim}
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": BelieverBelief(config, args.belief_amp)})
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
@@ -621,14 +613,9 @@ def train_belief(args: Args, path: Path) -> None:
     if args.chrono_init:
         chrono_init(history.gru, len(sample["actions"]))
     if args.image_norm == "mean":
-        rgb = np.load(episodes.dataset / "rgb.npy", mmap_mode="r")
-        frames = np.array(rgb[: len(train)][:128, ::8], np.float32)  # a sample that fits into memory
-        history.image_mean = torch.from_numpy(frames.mean((0, 1)))
-        history.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
+        history.image_mean, history.image_std = stored["psi"]["image_mean"], stored["psi"]["image_std"]
     if args.history_joints:
-        joints = np.load(episodes.dataset / "joints.npy", mmap_mode="r")[: len(train)]
-        history.joints_mean = torch.from_numpy(joints.mean((0, 1)))
-        history.joints_std = torch.from_numpy(joints.std((0, 1)).clip(0.05))  # the floor is stage 1's
+        history.joints_mean, history.joints_std = stored["psi"]["joints_mean"], stored["psi"]["joints_std"]
     ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX: glibc keeps large tensors instead of asking for them anew,
     ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: an update is a third faster on a CPU
     model.to(device)

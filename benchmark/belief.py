@@ -79,7 +79,7 @@ def run(command: list[str]) -> float:
 def speed(device: torch.device) -> str:
     """One line: stage 2's update against the per-step loop on the same model and batch, as ratios of medians."""
     episodes, steps = (256, 90) if device.type == "cuda" else (8, 60)
-    config = {"image_shape": [128, 128, 3], "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
+    config = {"image_shape": [128, 128, 3], "joints_dim": 0, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
     model = nn.ModuleDict({"belief": aib_belief.AIBBelief(config)})
     model["posterior"] = aib_belief.GaussianMLP(16 + 256, [256, 256], 32, min_std=0.1)
     model["head"] = aib_belief.mlp([2 * 32 + 8 + 1, 256, 8])

@@ -21,7 +21,7 @@ from per_step_loop import PerStepHistory
 
 def test_whole_sequences_give_what_a_per_step_loop_gives() -> None:
     torch.manual_seed(0)
-    config = {"image_shape": [36, 36, 3], "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
+    config = {"image_shape": [36, 36, 3], "joints_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
     history = aib_belief.HistoryEncoder(config)
     batch = {"rgb": torch.randint(0, 256, (8, 3, 36, 36, 3), dtype=torch.uint8)}
     assert torch.allclose(history(batch)[0], PerStepHistory(history)(batch)[0], atol=1e-5)
@@ -44,7 +44,8 @@ def make_stage_1(folder: Path, episodes: int) -> int:
     for name, array in arrays.items():
         np.save(path / "dataset" / f"{name}.npy", array.astype(np.float32))
     content = {"kind": "repr", "env_id": TOY, "robot": "panda_wristcam", "mesh_triangles": 500, "num_val": 8}
-    aib_repr.save(path / "repr.pt", {**content, "u_dim": 4, "phi": aib_repr.StateEncoder(4, 4).state_dict()})
+    phi, psi = aib_repr.StateEncoder(4, 4), aib_repr.ObservationEncoder([128, 128, 3], 3, 4)
+    aib_repr.save(path / "repr.pt", {**content, "u_dim": 4, "phi": phi.state_dict(), "psi": psi.state_dict()})
     return rgb.nbytes
 
 

@@ -17,7 +17,7 @@ import ppo_believer
 from conftest import TOY
 
 IMAGE = [36, 36, 3]
-CONFIG = {"image_shape": IMAGE, "joints_dim": 0, "action_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
+CONFIG = {"image_shape": IMAGE, "joints_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
 T, B, A = 6, 3, 2
 SELECT, REPORT = slice(0, 20), slice(20, 40)
 
@@ -32,13 +32,11 @@ def belief_model(head: str = "flow", config: dict = CONFIG) -> nn.ModuleDict:
 
 def belief_batch(steps: int = T) -> dict[str, torch.Tensor]:
     torch.manual_seed(1)
-    actions = torch.rand(steps, B, A) * 2 - 1
     return {
         "rgb": torch.randint(0, 256, (steps + 1, B, *IMAGE), dtype=torch.uint8),
         "joints": torch.randn(steps + 1, B, 7),
         "u": torch.randn(steps + 1, B, CONFIG["u_dim"]),
-        "actions": actions,
-        "previous": torch.cat([torch.zeros(1, B, A), actions]),
+        "actions": torch.rand(steps, B, A) * 2 - 1,
         "cue": torch.zeros(B, 1),
     }
 
@@ -188,9 +186,9 @@ def test_particles_are_draws_from_prior_and_decoder() -> None:
     z_noise, u_noise = torch.randn(B, 30, 5), torch.randn(B, 30, 4)
     memory = None
     for t in range(2):
-        seen = {name: batch[name][t] for name in ("rgb", "joints", "previous")}
+        seen = {name: batch[name][t] for name in ("rgb", "joints")}
         drawn, memory = agent.draw_particles(seen, memory, z_noise, u_noise)
-    h, _ = belief.history({name: batch[name][:2] for name in ("rgb", "joints", "previous")})
+    h, _ = belief.history({name: batch[name][:2] for name in ("rgb", "joints")})
     p = belief.prior(h[1])
     assert drawn.shape == (B, 30, 4)
     for i in (0, 29):
@@ -216,14 +214,14 @@ def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
     assert torch.allclose(seen["particle"], means.transpose(0, 1), atol=1e-5)
 
 
-@pytest.mark.parametrize("layers, joints, actions", [(1, 0, 0), (2, 7, A)])
-def test_sequence_and_step_path_agree(layers: int, joints: int, actions: int) -> None:
-    config = {**CONFIG, "gru_layers": layers, "joints_dim": joints, "action_dim": actions}
+@pytest.mark.parametrize("layers, joints", [(1, 0), (2, 7)])
+def test_sequence_and_step_path_agree(layers: int, joints: int) -> None:
+    config = {**CONFIG, "gru_layers": layers, "joints_dim": joints}
     history, batch = belief_model(config=config)["belief"].history, belief_batch()
     whole, _ = history(batch)
     state = None
     for t in range(T + 1):
-        now = {name: batch[name][t : t + 1] for name in ("rgb", "joints", "previous")}
+        now = {name: batch[name][t : t + 1] for name in ("rgb", "joints")}
         h, state = history(now, state)
         assert torch.allclose(h[0], whole[t], atol=1e-5)
 
