@@ -5,16 +5,13 @@ tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) sh
 that shape to the prior, which is what the robot has when it acts.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
-         close to the published code: --image-norm none --no-chrono-init --bptt-steps 16 --no-history-joints
-         --gru-layers 3, on stage 1 with --no-reward-norm --kl-coef 0.03 --kl-reduction mean
 Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where they are missing, aib_repr.py runs first
-Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, diagnostics.png, TensorBoard events
+Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, TensorBoard events
 """
 
 import argparse
 import ctypes
 import fcntl
-import io
 import json
 import math
 import os
@@ -29,8 +26,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import torch.nn as nn
@@ -72,7 +67,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; any number gives the same results"""
+    """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -111,7 +106,7 @@ class Args:
     history_joints: bool = True
     """joints in the history, as in the paper; its authors' code has the image alone"""
     belief_amp: bool = BFLOAT16
-    """convolutions in bfloat16 while the belief is trained"""
+    """image network in bfloat16 while the belief is trained"""
     held_out_every: int = 50
     """updates between checkpoints, each with a look at held-out episodes"""
 
@@ -158,7 +153,7 @@ class NatureCNN(nn.Module):
 
     def __init__(self, image_shape: list[int], size: int, amp: bool):
         super().__init__()
-        self.amp = amp  # convolutions in bfloat16
+        self.amp = amp  # in bfloat16
         convs = [nn.Conv2d(image_shape[-1], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)]
         self.conv = nn.Sequential(*[module for conv in convs for module in (conv, nn.ReLU())], nn.Flatten())
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
@@ -183,7 +178,10 @@ class StateEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the history o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
+    """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
+
+    The paper's history (E.2) has the actions too; given them, z could carry a_t with no regard for the world.
+    """
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
@@ -197,34 +195,19 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
 
-    def embed(self, rgb: torch.Tensor) -> torch.Tensor:
-        """Images (B, H, W, 3) uint8 -> features (B, 512)."""
-        return self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+    def embed(self, rgb: torch.Tensor, joints: torch.Tensor) -> torch.Tensor:
+        """Images (B, H, W, 3) uint8 and joints (B, J) -> the GRU's input x (B, 512 + J), or (B, 512) without joints."""
+        x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+        return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
-    def forward(
-        self, batch: dict[str, torch.Tensor], memory: torch.Tensor | None = None, bptt_steps: int | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Encode T steps of B histories that go on from memory, the GRU's state: -> h (T, B, 256), memory.
-
-        batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
-        All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in
-        chunks that the backward pass computes once more. T = 1 is the step path of PPO.
-        """
-        chunks = batch["rgb"].flatten(0, 1).split(FRAMES)
-        again = partial(torch.utils.checkpoint.checkpoint, self.embed, use_reentrant=False)
-        x = torch.cat([again(chunk) for chunk in chunks]) if len(chunks) > 1 else self.embed(chunks[0])
-        x = x.view(*batch["rgb"].shape[:2], -1)
-        if self.use_joints:
-            x = torch.cat([x, (batch["joints"] - self.joints_mean) / self.joints_std], -1)
-        outputs = []
-        for chunk in x.split(bptt_steps or len(x)):
-            output, memory = self.gru(chunk, None if memory is None else memory.detach())
-            outputs.append(output)
-        return self.out(torch.cat([torch.cat(outputs), x], -1)), memory
+    def forward(self, x: torch.Tensor, memory: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """x (T, B, .) of T steps that go on from memory, the GRU's state (None: start) -> h (T, B, 256), memory."""
+        output, memory = self.gru(x, memory)
+        return self.out(torch.cat([output, x], -1)), memory
 
 
 def chrono_init(gru: nn.GRU, steps: int) -> None:
-    """Let the GRU start out remembering for 1 to steps steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
+    """Let the GRU start out remembering for 2 to steps steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
     gate = slice(gru.hidden_size, 2 * gru.hidden_size)  # torch orders the gates reset, update, new
     for layer in range(gru.num_layers):
         with torch.no_grad():
@@ -233,7 +216,10 @@ def chrono_init(gru: nn.GRU, steps: int) -> None:
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h), all that acting needs (paper 3.2)."""
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h), all that acting needs (paper 3.2).
+
+    config: image_shape [H, W, 3], joints_dim (0: none in the history), gru_layers, u_dim, z_dim.
+    """
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
@@ -252,6 +238,27 @@ class AIBBelief(nn.Module):
 # ---------------------------------------------------------------- losses
 
 
+def encode_history(history: nn.Module, batch: dict[str, torch.Tensor], bptt_steps: int | None = None) -> torch.Tensor:
+    """h (T, B, 256) of whole episodes: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
+
+    All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in chunks
+    that the backward pass computes once more. bptt_steps cuts back-propagation through time into pieces.
+    """
+    frames = [batch[name].flatten(0, 1).split(FRAMES) for name in ("rgb", "joints")]
+    chunks = list(zip(*frames, strict=True))
+    if len(chunks) == 1:
+        x = history.embed(*chunks[0])
+    else:
+        again = torch.utils.checkpoint.checkpoint
+        x = torch.cat([again(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
+    outputs, memory = [], None
+    for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
+        h, memory = history(piece, memory)
+        memory = memory.detach()
+        outputs.append(h)
+    return torch.cat(outputs)
+
+
 def elbo_terms(belief: nn.Module, posterior: nn.Module, u: torch.Tensor, h: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """Terms of -L_VAE at each step (...,): -log p(u|z,h) and KL(q || p); then z ~ q and the mean of q (..., z_dim)."""
     q = posterior(torch.cat([u, h], -1))
@@ -263,7 +270,10 @@ def elbo_terms(belief: nn.Module, posterior: nn.Module, u: torch.Tensor, h: torc
 def flow_matching_loss(
     head: nn.Module, action: torch.Tensor, z: torch.Tensor, z_next: torch.Tensor, noise: torch.Tensor, tau: torch.Tensor
 ) -> torch.Tensor:
-    """L_FM at each step (...,): the velocity at a_tau = (1 - tau) a_0 + tau a_1 against a_1 - a_0; noise is a_0."""
+    """L_FM at each step (...,): the velocity at a_tau = (1 - tau) a_0 + tau a_1 against a_1 - a_0.
+
+    action a_1 and noise a_0 (..., A); z and z_next (..., z_dim); tau (..., 1) in [0, 1].
+    """
     a_tau = (1 - tau) * noise + tau * action
     velocity = head(torch.cat([a_tau, tau, z, z_next], -1))
     return (velocity - (action - noise)).square().sum(-1)
@@ -271,18 +281,18 @@ def flow_matching_loss(
 
 def belief_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
     """L_Total = -L_VAE + lambda L_FM and its terms, averaged over all steps of a batch of whole episodes."""
-    h, _ = model["belief"].history(batch, bptt_steps=args.bptt_steps)
-    nll, kl, z, mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
+    h = encode_history(model["belief"].history, batch, args.bptt_steps)
+    nll, kl, z, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
     losses = {"nll": nll.mean(), "kl": kl.mean()}
     losses["total"] = losses["nll"] + args.beta * losses["kl"]
     if args.action_head != "none":
-        z = mean if args.fm_latent == "mean" else z
-        action = batch["actions"]
+        z = z_mean if args.fm_latent == "mean" else z
+        action, z, z_next = batch["actions"], z[:-1], z[1:]
         if args.action_head == "flow":
             noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
-            losses["action"] = flow_matching_loss(model["head"], action, z[:-1], z[1:], noise, tau).mean()
+            losses["action"] = flow_matching_loss(model["head"], action, z, z_next, noise, tau).mean()
         else:
-            losses["action"] = (model["head"](torch.cat([z[:-1], z[1:]], -1)) - action).square().sum(-1).mean()
+            losses["action"] = (model["head"](torch.cat([z, z_next], -1)) - action).square().sum(-1).mean()
         losses["total"] = losses["total"] + args.action_lambda * losses["action"]
     return losses
 
@@ -293,46 +303,43 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Ar
 class Episodes:
     """Whole episodes of dataset/ with u, time first; images on the GPU where they fit in half of its free memory."""
 
-    def __init__(self, dataset: Path, u: torch.Tensor, cue: torch.Tensor, device: torch.device):
-        self.dataset, self.u, self.cue, self.device, self.rgb = dataset, u.to(device), cue.to(device), device, None
-        rgb = np.load(dataset / "rgb.npy", mmap_mode="r")
+    def __init__(self, dataset: Path, u: torch.Tensor, device: torch.device):
+        arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
+        self.arrays = {name: x.to(device) for name, x in (*arrays.items(), ("u", u))}
+        self.file, self.device, self.rgb = dataset / "rgb.npy", device, None
+        rgb = np.load(self.file, mmap_mode="r")
         if device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
             self.rgb = torch.empty(rgb.shape, dtype=torch.uint8, device=device)
             for i in range(len(rgb)):
                 self.rgb[i] = torch.from_numpy(rgb[i])
 
     def __call__(self, index: np.ndarray) -> dict[str, torch.Tensor]:
-        """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K).
-
-        The maps are opened anew each time, so that pages once read do not stay in this process.
-        """
-        names = ("joints", "actions") if self.rgb is not None else ("rgb", "joints", "actions")
-        batch = {name: torch.from_numpy(np.load(self.dataset / f"{name}.npy", mmap_mode="r")[index]) for name in names}
+        """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
         if self.rgb is not None:
-            batch["rgb"] = self.rgb[torch.from_numpy(index).to(self.device)]
-        batch["u"] = self.u[index]
-        batch = {name: x.to(self.device).transpose(0, 1) for name, x in batch.items()}
-        return {**batch, "cue": self.cue[index]}
+            rgb = self.rgb[index]
+        else:  # opened anew each time, so that pages once read do not stay in this process
+            rgb = torch.from_numpy(np.load(self.file, mmap_mode="r")[index]).to(self.device)
+        batch = {"rgb": rgb, **{name: x[index] for name, x in self.arrays.items()}}
+        return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
 
 
 def load_episodes(args: Args) -> tuple[Episodes, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"]):
+    size = QUICK if args.quick else SMALL if args.small else {}
+    if not (path / "repr.pt").exists() and args.repr_dir == size.get("repr_dir", Args.repr_dir):
         run_stage("aib_repr.py", args)
-    hint = "make it anew with aib_repr.py --overwrite, where --env-id, --seed, --small and --quick are the same as here"
-    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
+    hint = "make it anew with aib_repr.py --overwrite and the same --env-id, --seed, --num-episodes and size"
+    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
+    phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
+    phi.load_state_dict(stored["phi"])
     try:
-        names = ("rgb", "joints", "state", "actions", "cue")
-        arrays = {name: np.load(path / "dataset" / f"{name}.npy", mmap_mode="r") for name in names}
+        with torch.no_grad():
+            u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
+        return Episodes(path / "dataset", u, torch.device(args.device)), stored
     except (OSError, ValueError) as error:
         fail(f"{path / 'dataset'} is damaged or incomplete ({error}); {hint}")
-    phi = StateEncoder(arrays["state"].shape[-1], stored["u_dim"])
-    phi.load_state_dict(stored["phi"])
-    with torch.no_grad():
-        u = phi(torch.from_numpy(np.array(arrays["state"]))).mean
-    return Episodes(path / "dataset", u, torch.from_numpy(np.array(arrays["cue"])), torch.device(args.device)), stored
 
 
 # ---------------------------------------------------------------- evaluation
@@ -355,17 +362,18 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
 
 @torch.no_grad()
 def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: np.ndarray) -> dict[str, torch.Tensor]:
-    """What the belief makes of episodes index (E,), each (E, T+1, .): h, u, action (E, T, A), cue (E, K), and
+    """What the belief makes of episodes index (E,).
 
-    particle: the mean of 30 decoded prior samples; z, z_mean: the posterior's sample and mean; posterior: that decoded;
-    nll_prior: -log p(u|h) (E, T+1), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows
-    of three possible places is right about each; nll_posterior: -log p(u|z,h) under one z of the posterior.
+    h (E, T+1, 256); u (E, T+1, u_dim), action (E, T, A), cue (E, K) as they were; z, z_mean (E, T+1, z_dim) of q(z|u,h)
+    particle (E, T+1, u_dim): mean of 30 decoded prior samples; posterior (E, T+1, u_dim): z_mean decoded
+    nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows of
+    three possible places is right about each; nll_posterior (E, T+1): -log p(u|z,h) under z
     """
     torch.manual_seed(0)  # the same noise at every look, so that looks compare
     parts = []
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
-        u, (h, _) = batch["u"], belief.history(batch)
+        u, h = batch["u"], encode_history(belief.history, batch)
         nll, _, z, mean = elbo_terms(belief, posterior, u, h)
         decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
@@ -386,8 +394,8 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
     nll, nll_posterior = test["nll_prior"].mean().item(), test["nll_posterior"].mean().item()
     report = {"nll_prior": nll, "nll_posterior": nll_posterior, "prior_gap": nll - nll_posterior}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
-        left = (test["u"] - test[source]).square().sum((0, 2))
-        report[name] = (1 - left / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
+        residual = (test["u"] - test[source]).square().sum((0, 2))
+        report[name] = (1 - residual / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
     for name in ("h", "particle", "u"):
         steps = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
         report[f"cue_from_{name}"] = [readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
@@ -412,26 +420,6 @@ def flow_gain(head: nn.Module, z: torch.Tensor, action: torch.Tensor) -> tuple[f
     return right.item(), (wrong - right).item()
 
 
-def plot_diagnostics(report: dict, title: str) -> bytes:
-    """Draw the report as a PNG: the cue's read-out and the reconstruction of u against time."""
-    matplotlib.use("Agg")
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
-    left.plot(report["cue_from_u"], "k:", label="from u itself")
-    left.plot(report["cue_from_h"], "C0-", label="from h")
-    left.plot(report["cue_from_particle"], "C1--", label="from the mean particle")
-    left.axhline(report["cue_chance"], color="grey", linestyle="-.", label="chance")
-    left.set(xlabel="step", ylabel="held-out accuracy, or R2", title="cue, linear read-out", ylim=(-0.5, 1.05))
-    right.plot(report["u_r2_posterior"], "k:", label="posterior (sees u)")
-    right.plot(report["u_r2_prior"], "C1-", label="prior (mean particle)")
-    right.set(xlabel="step", ylabel="R2", title="reconstruction of u", ylim=(-0.5, 1.05))
-    for axes in (left, right):
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, frameon=False)
-    figure.suptitle(f"{title}: action read-out R2 {report['action_readout']:.3f}")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
-
-
 # ---------------------------------------------------------------- training
 
 
@@ -443,7 +431,7 @@ def main(args: Args) -> None:
         return
     episodes, stored = load_episodes(args)
     # of the held-out episodes, read-outs are fitted on one half and tested on the other
-    train, fit_on, test_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
+    train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-stored["num_val"], -(stored["num_val"] // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
@@ -458,11 +446,12 @@ def main(args: Args) -> None:
     if args.chrono_init:
         chrono_init(history.gru, len(sample["actions"]))
     if args.image_norm == "mean":
-        history.image_mean, history.image_std = stored["psi"]["image_mean"], stored["psi"]["image_std"]
+        history.image_mean, history.image_std = stored["norm"]["image_mean"], stored["norm"]["image_std"]
     if args.history_joints:
-        history.joints_mean, history.joints_std = stored["psi"]["joints_mean"], stored["psi"]["joints_std"]
-    ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX: glibc keeps large tensors instead of asking for them anew,
-    ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: an update is a third faster on a CPU
+        history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
+    # glibc keeps freed memory instead of asking for it anew: an update is a third faster on a CPU
+    ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
+    ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first = 0
@@ -504,17 +493,21 @@ def main(args: Args) -> None:
     # the last weights: held-out error and likelihood are best before the belief remembers
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = diagnose_belief(fit, test)
-    cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)  # for eval/cue_readout of PPO
-    known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
     if args.action_head == "flow":
         report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["action"])
         sampled = flow_gain(model["head"], test["z"], test["action"])
         report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
-    save(path / "diagnostics.png", plot_diagnostics(report, f"{args.env_id}, {args.exp_name}"))
-    content = {"kind": "aib_belief", **asdict(args), "config": config, "known": known}
-    save(path / "belief.pt", {**content, "belief": model["belief"].state_dict(), "training": model.state_dict()})
-    print(f"{path / 'diagnostics.png'} shows what the belief remembers")
+    some = fit["particle"][:, ::8]  # every 8th step is enough
+    readout_data = {"particle": some.flatten(0, 1), "cue": fit["cue"].repeat_interleave(some.shape[1], 0)}
+    content = {"kind": "aib_belief", **asdict(args), "config": config, "readout_data": readout_data}
+    save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
+    for name, values in report.items():  # curves over an episode's steps
+        for step, value in enumerate(values if isinstance(values, list) else []):
+            writer.add_scalar(f"by_time_step/{name}", value, step)
+    writer.close()
+    known = [f"{name} {report[name][-1]:.2f}" for name in ("cue_from_u", "cue_from_particle", "u_r2_prior")]
+    print(f"{path / 'belief.pt'}, at the last step of held-out episodes: {', '.join(known)}")
 
 
 # ---------------------------------------------------------------- files and stages

@@ -1,10 +1,10 @@
 """AIB stage 1: a random-policy dataset and a compact encoder of the privileged state (paper section 3.1, Algorithm 1).
 
 phi(s) is trained with psi(o) to predict reward and next latents, and pays by its KL for what it carries: it is left
-with what matters and cannot be seen. Of psi, later stages use only how it standardises images and joints.
+with what matters and cannot be seen. Only phi is kept, with how psi standardises images and joints.
 
 Usage:   python aib_repr.py --env-id InterceptFast-v0
-Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, diagnostics.json, TensorBoard events
+Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events
 """
 
 import argparse
@@ -36,7 +36,6 @@ import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
-from sklearn import linear_model, pipeline, preprocessing
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -71,7 +70,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; any number gives the same results"""
+    """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -106,7 +105,7 @@ class Args:
     kl_reduction: Literal["sum", "mean"] = "sum"
     """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
     amp: bool = BFLOAT16
-    """convolutions in bfloat16"""
+    """image network in bfloat16"""
 
 
 SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, epochs=7, batch_size=100, learning_rate=1e-3)
@@ -149,7 +148,7 @@ class NatureCNN(nn.Module):
 
     def __init__(self, image_shape: list[int], size: int, amp: bool):
         super().__init__()
-        self.amp = amp  # convolutions in bfloat16
+        self.amp = amp  # in bfloat16
         convs = [nn.Conv2d(image_shape[-1], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)]
         self.conv = nn.Sequential(*[module for conv in convs for module in (conv, nn.ReLU())], nn.Flatten())
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
@@ -283,35 +282,6 @@ def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> 
     return {name: torch.from_numpy(x).to(device) for name, x in batch.items()}
 
 
-# ---------------------------------------------------------------- evaluation
-
-
-def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
-
-    The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
-    """
-    varies = y.amax(0) > y.amin(0)
-    if not varies.any():
-        return math.nan
-    x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
-    classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
-    model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
-    model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
-    return float(np.mean([model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]))
-
-
-@torch.no_grad()
-def diagnose_repr(phi: StateEncoder, state: torch.Tensor, cue: torch.Tensor, num_val: int) -> dict[str, float]:
-    """Active dimensions of u in the last num_val episodes, and read-out of their cue; state (N, T+1, D), cue (N, K)."""
-    torch.manual_seed(0)
-    u, cue = phi(state).mean, cue[:, None].expand(-1, state.shape[1], -1)
-    active = (u[-num_val:].std((0, 1)) > 0.1).sum().item()
-    u = u + 0.1 * torch.randn_like(u)  # stage 2's decoder cannot know it better than this
-    rows = (x.flatten(0, 1) for x in (u[:-num_val], cue[:-num_val], u[-num_val:], cue[-num_val:]))
-    return {"active_dimensions": active, "cue_readout": readout_score(*rows)}
-
-
 # ---------------------------------------------------------------- training
 
 
@@ -371,6 +341,8 @@ def main(args: Args) -> None:
         with torch.no_grad():
             some = read_transitions(dataset, held_out[:: len(held_out) // 1000 + 1], device)
             val_losses = repr_losses(model, some, args)
+            active = (phi(some["state"]).mean.std(0) > 0.1).sum()
+        writer.add_scalar("held_out/active_dimensions", active, bar.n)  # of u: the others are silent
         for name, loss in losses.items():
             writer.add_scalar(f"losses/{name}", loss, bar.n)
             writer.add_scalar(f"held_out/{name}", val_losses[name], bar.n)
@@ -379,11 +351,9 @@ def main(args: Args) -> None:
         save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
-    report = diagnose_repr(phi.cpu(), torch.from_numpy(arrays["state"]), torch.from_numpy(arrays["cue"]), num_val)
-    save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     content = {"kind": "repr", **asdict(args), "num_val": num_val}
-    save(path / "repr.pt", {**content, "phi": phi.state_dict(), "psi": psi.state_dict()})
-    print(f"{path / 'repr.pt'}: " + ", ".join(f"{name} {value:.3g}" for name, value in report.items()))
+    save(path / "repr.pt", {**content, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())})
+    print(f"{path / 'repr.pt'} is finished")
 
 
 # ---------------------------------------------------------------- simulator
@@ -393,7 +363,7 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and the task's other facts.
     """
 
     def __init__(self, env: gym.Env):

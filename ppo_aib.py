@@ -39,7 +39,6 @@ import numpy as np
 import sapien
 import torch
 import torch.nn as nn
-import torch.utils.checkpoint
 import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
@@ -50,7 +49,6 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
-FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
@@ -81,7 +79,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; any number gives the same results"""
+    """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -100,7 +98,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training"""
     num_envs: int = 256
-    """whole episodes per iteration"""
+    """whole episodes per iteration; on physx_cuda one batch, with one arm pose"""
     learning_rate: float = 1e-4
     """Adam's"""
     update_epochs: int = 2
@@ -128,7 +126,7 @@ class Args:
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
     amp: bool = False
-    """convolutions in bfloat16"""
+    """image network in bfloat16"""
     evaluate: bool = False
     """only evaluate --checkpoint"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
@@ -182,7 +180,7 @@ class NatureCNN(nn.Module):
 
     def __init__(self, image_shape: list[int], size: int, amp: bool):
         super().__init__()
-        self.amp = amp  # convolutions in bfloat16
+        self.amp = amp  # in bfloat16
         convs = [nn.Conv2d(image_shape[-1], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)]
         self.conv = nn.Sequential(*[module for conv in convs for module in (conv, nn.ReLU())], nn.Flatten())
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
@@ -194,7 +192,10 @@ class NatureCNN(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the history o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
+    """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
+
+    The paper's history (E.2) has the actions too; given them, z could carry a_t with no regard for the world.
+    """
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
@@ -208,34 +209,22 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
 
-    def embed(self, rgb: torch.Tensor) -> torch.Tensor:
-        """Images (B, H, W, 3) uint8 -> features (B, 512)."""
-        return self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+    def embed(self, rgb: torch.Tensor, joints: torch.Tensor) -> torch.Tensor:
+        """Images (B, H, W, 3) uint8 and joints (B, J) -> the GRU's input x (B, 512 + J), or (B, 512) without joints."""
+        x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+        return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
-    def forward(
-        self, batch: dict[str, torch.Tensor], memory: torch.Tensor | None = None, bptt_steps: int | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Encode T steps of B histories that go on from memory, the GRU's state: -> h (T, B, 256), memory.
-
-        batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
-        All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in
-        chunks that the backward pass computes once more. T = 1 is the step path of PPO.
-        """
-        chunks = batch["rgb"].flatten(0, 1).split(FRAMES)
-        again = partial(torch.utils.checkpoint.checkpoint, self.embed, use_reentrant=False)
-        x = torch.cat([again(chunk) for chunk in chunks]) if len(chunks) > 1 else self.embed(chunks[0])
-        x = x.view(*batch["rgb"].shape[:2], -1)
-        if self.use_joints:
-            x = torch.cat([x, (batch["joints"] - self.joints_mean) / self.joints_std], -1)
-        outputs = []
-        for chunk in x.split(bptt_steps or len(x)):
-            output, memory = self.gru(chunk, None if memory is None else memory.detach())
-            outputs.append(output)
-        return self.out(torch.cat([torch.cat(outputs), x], -1)), memory
+    def forward(self, x: torch.Tensor, memory: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """x (T, B, .) of T steps that go on from memory, the GRU's state (None: start) -> h (T, B, 256), memory."""
+        output, memory = self.gru(x, memory)
+        return self.out(torch.cat([output, x], -1)), memory
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h), all that acting needs (paper 3.2)."""
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h), all that acting needs (paper 3.2).
+
+    config: image_shape [H, W, 3], joints_dim (0: none in the history), gru_layers, u_dim, z_dim.
+    """
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
@@ -280,7 +269,8 @@ class BeliefAgent(nn.Module):
 
         obs: rgb, joints; noise (B, n, .); memory: the history encoder's, None at the start of an episode.
         """
-        h, memory = self.belief.history({name: x[None] for name, x in obs.items()}, memory)
+        x = self.belief.history.embed(obs["rgb"], obs["joints"])
+        h, memory = self.belief.history(x[None], memory)
         decoded = self.belief.decode(h[0], z_noise)
         return decoded.mean + decoded.stddev * u_noise, memory
 
@@ -328,7 +318,7 @@ def rollout_with_belief(
 
     Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
     V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs; as all noise is drawn before, nothing depends on them on physx_cpu.
+    episodes are played in rounds of envs.num_envs; as all noise is drawn before, they do not change it on physx_cpu.
     """
     steps, count, (action_dim,) = envs.spec.max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
@@ -401,15 +391,17 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
     return float(np.mean([model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]))
 
 
-def evaluate_with_belief(envs: gym.Env, agent: BeliefAgent, args: Args, known: dict) -> tuple[dict[str, float], bytes]:
+def evaluate_with_belief(
+    envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, readout_data: dict[str, torch.Tensor]
+) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    cue_readout: how well a read-out fitted on known, mean particles and cues under random actions, tells the cue here.
+    cue_readout: cue (M, K) from mean particle (M, u_dim), fitted on readout_data, random actions', and tested here.
     """
     torch.manual_seed(0)
     data = rollout_with_belief(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), explore=False)
     particle, cue = data["particles"].mean(-2).flatten(0, 1), data["cue"].flatten(0, 1)
-    cue_readout = readout_score(known["particle"], known["cue"], particle, cue)
+    cue_readout = readout_score(readout_data["particle"], readout_data["cue"], particle, cue)
     return {**success_and_return(data), "cue_readout": cue_readout}, make_video(data)
 
 
@@ -423,19 +415,20 @@ def main(args: Args) -> None:
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
         for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
             setattr(args, name, stored[name])
-    check_task(args)
-    path = file.parent if args.evaluate else open_run(args)
-    resume = not args.evaluate and (path / "checkpoint.pt").exists()
-    checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
-    if checkpoint.get("finished"):
-        print(f"{path} is finished; --overwrite makes it anew")
-        return
-    if not args.evaluate:
-        file = Path(args.belief.format(**vars(args)))
-        if not file.exists() and args.belief in (Args.belief, SMALL["belief"], QUICK["belief"]):
+        check_task(args)
+    else:
+        check_task(args)
+        path = open_run(args)
+        resume = (path / "checkpoint.pt").exists()
+        checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
+        if checkpoint.get("finished"):
+            print(f"{path} is finished; --overwrite makes it anew")
+            return
+        file, size = Path(args.belief.format(**vars(args))), QUICK if args.quick else SMALL if args.small else {}
+        if not file.exists() and args.belief == size.get("belief", Args.belief):
             run_stage("aib_belief.py", args)
-        hint = "make it anew with aib_belief.py --overwrite, where --env-id, --seed, --small and --quick are the same"
-        task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
+        hint = "make it anew with aib_belief.py --overwrite and the same --env-id, --seed, --num-episodes and size"
+        task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
         stored = load(file, hint, kind="aib_belief", **task)
 
     envs, device = make_envs(args), torch.device(args.device)
@@ -445,9 +438,9 @@ def main(args: Args) -> None:
     agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
     if args.evaluate:
         agent.load_state_dict(stored["agent"])
-        metrics, video = evaluate_with_belief(envs, agent, args, stored["known"])
-        save(path / "evaluation.json", json.dumps(metrics, indent=2).encode())
-        save(path / "evaluation.mp4", video)
+        metrics, video = evaluate_with_belief(envs, agent, args, stored["readout_data"])
+        save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
+        save(file.with_name("evaluation.mp4"), video)
         print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
         return
 
@@ -492,14 +485,14 @@ def main(args: Args) -> None:
         del data, batch, losses  # a gigabyte of images and a graph: not two at a time
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
-            metrics, video = evaluate_with_belief(envs, agent, args, stored["known"])
+            metrics, video = evaluate_with_belief(envs, agent, args, stored["readout_data"])
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
             metrics.pop("cue_readout")  # the columns of eval.csv are those of plain PPO
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
             lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"config": stored["config"], "known": stored["known"], "agent": agent.state_dict()}
+            content = {"config": stored["config"], "readout_data": stored["readout_data"], "agent": agent.state_dict()}
             content |= {"kind": "ppo_aib agent", "global_step": global_step}
             save(path / "agent.pt", {**asdict(args), **content})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
@@ -524,7 +517,7 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and the task's other facts.
     """
 
     def __init__(self, env: gym.Env):

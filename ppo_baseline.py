@@ -69,7 +69,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; any number gives the same results"""
+    """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -80,7 +80,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training"""
     num_envs: int = 256
-    """whole episodes per iteration"""
+    """whole episodes per iteration; on physx_cuda one batch, with one arm pose"""
     learning_rate: float = 1e-4
     """Adam's"""
     update_epochs: int = 2
@@ -108,7 +108,7 @@ class Args:
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
     amp: bool = False
-    """convolutions in bfloat16"""
+    """image network in bfloat16"""
     evaluate: bool = False
     """only evaluate --checkpoint"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
@@ -141,7 +141,7 @@ class NatureCNN(nn.Module):
 
     def __init__(self, image_shape: list[int], size: int, amp: bool):
         super().__init__()
-        self.amp = amp  # convolutions in bfloat16
+        self.amp = amp  # in bfloat16
         convs = [nn.Conv2d(image_shape[-1], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)]
         self.conv = nn.Sequential(*[module for conv in convs for module in (conv, nn.ReLU())], nn.Flatten())
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
@@ -213,7 +213,7 @@ def rollout(
     """Play one whole episode per seed; without explore, actions are the policy's means.
 
     Returns arrays (T, N, ...): rgb uint8, joints, action, logprob, reward, success; and value (T+1, N), V(o_T) last.
-    Episodes are played in rounds of envs.num_envs; as all noise is drawn before, nothing depends on them on physx_cpu.
+    Episodes are played in rounds of envs.num_envs; as all noise is drawn before, they do not change it on physx_cpu.
     """
     steps, count, (action_dim,) = envs.spec.max_episode_steps, len(seeds), envs.single_action_space.shape
     device = torch.device(args.device)
@@ -284,13 +284,15 @@ def main(args: Args) -> None:
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_baseline agent")
         for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp"):
             setattr(args, name, stored[name])
-    check_task(args)
-    path = file.parent if args.evaluate else open_run(args)
-    resume = not args.evaluate and (path / "checkpoint.pt").exists()
-    checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
-    if checkpoint.get("finished"):
-        print(f"{path} is finished; --overwrite makes it anew")
-        return
+        check_task(args)
+    else:
+        check_task(args)
+        path = open_run(args)
+        resume = (path / "checkpoint.pt").exists()
+        checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
+        if checkpoint.get("finished"):
+            print(f"{path} is finished; --overwrite makes it anew")
+            return
 
     envs, device = make_envs(args), torch.device(args.device)
     image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
@@ -299,8 +301,8 @@ def main(args: Args) -> None:
     if args.evaluate:
         agent.load_state_dict(stored["agent"])
         metrics, video = evaluate(envs, agent, args)
-        save(path / "evaluation.json", json.dumps(metrics, indent=2).encode())
-        save(path / "evaluation.mp4", video)
+        save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
+        save(file.with_name("evaluation.mp4"), video)
         print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
         return
 
@@ -374,7 +376,7 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and the task's other facts.
     """
 
     def __init__(self, env: gym.Env):

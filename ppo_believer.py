@@ -6,14 +6,13 @@ action head. Networks, settings, PPO, evaluation and tags are those of aib_belie
 Usage:   python ppo_believer.py --env-id InterceptFast-v0
          python ppo_believer.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_believer__1/agent.pt
 Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where they are missing, aib_repr.py runs first
-Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, diagnostics.png, agent.pt, eval.csv, videos/,
+Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, agent.pt, eval.csv, videos/,
          TensorBoard events
 """
 
 import argparse
 import ctypes
 import fcntl
-import io
 import json
 import math
 import multiprocessing
@@ -36,8 +35,6 @@ from typing import Literal, NoReturn
 import fast_simplification
 import gymnasium as gym
 import imageio.v3 as iio
-import matplotlib
-import matplotlib.pyplot as plt
 import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
 import numpy as np
 import sapien
@@ -85,7 +82,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; any number gives the same results"""
+    """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -118,7 +115,7 @@ class Args:
     history_joints: bool = True
     """joints in the history, as in the paper; its authors' code has the image alone"""
     belief_amp: bool = BFLOAT16
-    """convolutions in bfloat16 while the belief is trained"""
+    """image network in bfloat16 while the belief is trained"""
     held_out_every: int = 50
     """updates between checkpoints, each with a look at held-out episodes"""
 
@@ -129,7 +126,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training"""
     num_envs: int = 256
-    """whole episodes per iteration"""
+    """whole episodes per iteration; on physx_cuda one batch, with one arm pose"""
     learning_rate: float = 1e-4
     """Adam's"""
     update_epochs: int = 2
@@ -157,7 +154,7 @@ class Args:
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
     amp: bool = False
-    """convolutions in bfloat16"""
+    """image network in bfloat16"""
     evaluate: bool = False
     """only evaluate --checkpoint"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
@@ -212,7 +209,7 @@ class NatureCNN(nn.Module):
 
     def __init__(self, image_shape: list[int], size: int, amp: bool):
         super().__init__()
-        self.amp = amp  # convolutions in bfloat16
+        self.amp = amp  # in bfloat16
         convs = [nn.Conv2d(image_shape[-1], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)]
         self.conv = nn.Sequential(*[module for conv in convs for module in (conv, nn.ReLU())], nn.Flatten())
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
@@ -237,7 +234,10 @@ class StateEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the history o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input."""
+    """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
+
+    The paper's history (E.2) has the actions too; given them, z could carry a_t with no regard for the world.
+    """
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
@@ -251,34 +251,19 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
 
-    def embed(self, rgb: torch.Tensor) -> torch.Tensor:
-        """Images (B, H, W, 3) uint8 -> features (B, 512)."""
-        return self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+    def embed(self, rgb: torch.Tensor, joints: torch.Tensor) -> torch.Tensor:
+        """Images (B, H, W, 3) uint8 and joints (B, J) -> the GRU's input x (B, 512 + J), or (B, 512) without joints."""
+        x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+        return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
-    def forward(
-        self, batch: dict[str, torch.Tensor], memory: torch.Tensor | None = None, bptt_steps: int | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Encode T steps of B histories that go on from memory, the GRU's state: -> h (T, B, 256), memory.
-
-        batch: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
-        All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in
-        chunks that the backward pass computes once more. T = 1 is the step path of PPO.
-        """
-        chunks = batch["rgb"].flatten(0, 1).split(FRAMES)
-        again = partial(torch.utils.checkpoint.checkpoint, self.embed, use_reentrant=False)
-        x = torch.cat([again(chunk) for chunk in chunks]) if len(chunks) > 1 else self.embed(chunks[0])
-        x = x.view(*batch["rgb"].shape[:2], -1)
-        if self.use_joints:
-            x = torch.cat([x, (batch["joints"] - self.joints_mean) / self.joints_std], -1)
-        outputs = []
-        for chunk in x.split(bptt_steps or len(x)):
-            output, memory = self.gru(chunk, None if memory is None else memory.detach())
-            outputs.append(output)
-        return self.out(torch.cat([torch.cat(outputs), x], -1)), memory
+    def forward(self, x: torch.Tensor, memory: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """x (T, B, .) of T steps that go on from memory, the GRU's state (None: start) -> h (T, B, 256), memory."""
+        output, memory = self.gru(x, memory)
+        return self.out(torch.cat([output, x], -1)), memory
 
 
 def chrono_init(gru: nn.GRU, steps: int) -> None:
-    """Let the GRU start out remembering for 1 to steps steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
+    """Let the GRU start out remembering for 2 to steps steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
     gate = slice(gru.hidden_size, 2 * gru.hidden_size)  # torch orders the gates reset, update, new
     for layer in range(gru.num_layers):
         with torch.no_grad():
@@ -287,7 +272,10 @@ def chrono_init(gru: nn.GRU, steps: int) -> None:
 
 
 class BelieverBelief(nn.Module):
-    """b(h) of Believer: history encoder, fixed prior N(0, I) and decoder p(u|z,h), all that acting needs."""
+    """b(h) of Believer: history encoder, fixed prior N(0, I) and decoder p(u|z,h), all that acting needs.
+
+    config: image_shape [H, W, 3], joints_dim (0: none in the history), gru_layers, u_dim, z_dim.
+    """
 
     def __init__(self, config: dict, amp: bool = False):
         super().__init__()
@@ -334,12 +322,34 @@ class BeliefAgent(nn.Module):
 
         obs: rgb, joints; noise (B, n, .); memory: the history encoder's, None at the start of an episode.
         """
-        h, memory = self.belief.history({name: x[None] for name, x in obs.items()}, memory)
+        x = self.belief.history.embed(obs["rgb"], obs["joints"])
+        h, memory = self.belief.history(x[None], memory)
         decoded = self.belief.decode(h[0], z_noise)
         return decoded.mean + decoded.stddev * u_noise, memory
 
 
 # ---------------------------------------------------------------- losses
+
+
+def encode_history(history: nn.Module, batch: dict[str, torch.Tensor], bptt_steps: int | None = None) -> torch.Tensor:
+    """h (T, B, 256) of whole episodes: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
+
+    All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in chunks
+    that the backward pass computes once more. bptt_steps cuts back-propagation through time into pieces.
+    """
+    frames = [batch[name].flatten(0, 1).split(FRAMES) for name in ("rgb", "joints")]
+    chunks = list(zip(*frames, strict=True))
+    if len(chunks) == 1:
+        x = history.embed(*chunks[0])
+    else:
+        again = torch.utils.checkpoint.checkpoint
+        x = torch.cat([again(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
+    outputs, memory = [], None
+    for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
+        h, memory = history(piece, memory)
+        memory = memory.detach()
+        outputs.append(h)
+    return torch.cat(outputs)
 
 
 def elbo_terms(belief: nn.Module, posterior: nn.Module, u: torch.Tensor, h: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -352,7 +362,7 @@ def elbo_terms(belief: nn.Module, posterior: nn.Module, u: torch.Tensor, h: torc
 
 def believer_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
     """-ELBO with the fixed prior and its terms, averaged over all steps of a batch of whole episodes."""
-    h, _ = model["belief"].history(batch, bptt_steps=args.bptt_steps)
+    h = encode_history(model["belief"].history, batch, args.bptt_steps)
     nll, kl, _, _ = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
     return {"nll": nll.mean(), "kl": kl.mean(), "total": nll.mean() + args.beta * kl.mean()}
 
@@ -392,46 +402,43 @@ def ppo_losses(agent: nn.Module, batch: dict[str, torch.Tensor], args: Args) -> 
 class Episodes:
     """Whole episodes of dataset/ with u, time first; images on the GPU where they fit in half of its free memory."""
 
-    def __init__(self, dataset: Path, u: torch.Tensor, cue: torch.Tensor, device: torch.device):
-        self.dataset, self.u, self.cue, self.device, self.rgb = dataset, u.to(device), cue.to(device), device, None
-        rgb = np.load(dataset / "rgb.npy", mmap_mode="r")
+    def __init__(self, dataset: Path, u: torch.Tensor, device: torch.device):
+        arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
+        self.arrays = {name: x.to(device) for name, x in (*arrays.items(), ("u", u))}
+        self.file, self.device, self.rgb = dataset / "rgb.npy", device, None
+        rgb = np.load(self.file, mmap_mode="r")
         if device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
             self.rgb = torch.empty(rgb.shape, dtype=torch.uint8, device=device)
             for i in range(len(rgb)):
                 self.rgb[i] = torch.from_numpy(rgb[i])
 
     def __call__(self, index: np.ndarray) -> dict[str, torch.Tensor]:
-        """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K).
-
-        The maps are opened anew each time, so that pages once read do not stay in this process.
-        """
-        names = ("joints", "actions") if self.rgb is not None else ("rgb", "joints", "actions")
-        batch = {name: torch.from_numpy(np.load(self.dataset / f"{name}.npy", mmap_mode="r")[index]) for name in names}
+        """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
         if self.rgb is not None:
-            batch["rgb"] = self.rgb[torch.from_numpy(index).to(self.device)]
-        batch["u"] = self.u[index]
-        batch = {name: x.to(self.device).transpose(0, 1) for name, x in batch.items()}
-        return {**batch, "cue": self.cue[index]}
+            rgb = self.rgb[index]
+        else:  # opened anew each time, so that pages once read do not stay in this process
+            rgb = torch.from_numpy(np.load(self.file, mmap_mode="r")[index]).to(self.device)
+        batch = {"rgb": rgb, **{name: x[index] for name, x in self.arrays.items()}}
+        return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
 
 
 def load_episodes(args: Args) -> tuple[Episodes, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    if not (path / "repr.pt").exists() and args.repr_dir in (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"]):
+    size = QUICK if args.quick else SMALL if args.small else {}
+    if not (path / "repr.pt").exists() and args.repr_dir == size.get("repr_dir", Args.repr_dir):
         run_stage("aib_repr.py", args)
-    hint = "make it anew with aib_repr.py --overwrite, where --env-id, --seed, --small and --quick are the same as here"
-    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles")}
+    hint = "make it anew with aib_repr.py --overwrite and the same --env-id, --seed, --num-episodes and size"
+    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
+    phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
+    phi.load_state_dict(stored["phi"])
     try:
-        names = ("rgb", "joints", "state", "actions", "cue")
-        arrays = {name: np.load(path / "dataset" / f"{name}.npy", mmap_mode="r") for name in names}
+        with torch.no_grad():
+            u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
+        return Episodes(path / "dataset", u, torch.device(args.device)), stored
     except (OSError, ValueError) as error:
         fail(f"{path / 'dataset'} is damaged or incomplete ({error}); {hint}")
-    phi = StateEncoder(arrays["state"].shape[-1], stored["u_dim"])
-    phi.load_state_dict(stored["phi"])
-    with torch.no_grad():
-        u = phi(torch.from_numpy(np.array(arrays["state"]))).mean
-    return Episodes(path / "dataset", u, torch.from_numpy(np.array(arrays["cue"])), torch.device(args.device)), stored
 
 
 @torch.no_grad()
@@ -442,7 +449,7 @@ def rollout_with_belief(
 
     Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
     V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs; as all noise is drawn before, nothing depends on them on physx_cpu.
+    episodes are played in rounds of envs.num_envs; as all noise is drawn before, they do not change it on physx_cpu.
     """
     steps, count, (action_dim,) = envs.spec.max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
@@ -497,17 +504,18 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
 
 @torch.no_grad()
 def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: np.ndarray) -> dict[str, torch.Tensor]:
-    """What the belief makes of episodes index (E,), each (E, T+1, .): h, u, action (E, T, A), cue (E, K), and
+    """What the belief makes of episodes index (E,).
 
-    particle: the mean of 30 decoded prior samples; z, z_mean: the posterior's sample and mean; posterior: that decoded;
-    nll_prior: -log p(u|h) (E, T+1), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows
-    of three possible places is right about each; nll_posterior: -log p(u|z,h) under one z of the posterior.
+    h (E, T+1, 256); u (E, T+1, u_dim), action (E, T, A), cue (E, K) as they were; z, z_mean (E, T+1, z_dim) of q(z|u,h)
+    particle (E, T+1, u_dim): mean of 30 decoded prior samples; posterior (E, T+1, u_dim): z_mean decoded
+    nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows of
+    three possible places is right about each; nll_posterior (E, T+1): -log p(u|z,h) under z
     """
     torch.manual_seed(0)  # the same noise at every look, so that looks compare
     parts = []
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
-        u, (h, _) = batch["u"], belief.history(batch)
+        u, h = batch["u"], encode_history(belief.history, batch)
         nll, _, z, mean = elbo_terms(belief, posterior, u, h)
         decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
@@ -528,8 +536,8 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
     nll, nll_posterior = test["nll_prior"].mean().item(), test["nll_posterior"].mean().item()
     report = {"nll_prior": nll, "nll_posterior": nll_posterior, "prior_gap": nll - nll_posterior}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
-        left = (test["u"] - test[source]).square().sum((0, 2))
-        report[name] = (1 - left / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
+        residual = (test["u"] - test[source]).square().sum((0, 2))
+        report[name] = (1 - residual / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
     for name in ("h", "particle", "u"):
         steps = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
         report[f"cue_from_{name}"] = [readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
@@ -540,26 +548,6 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
     classes = [] if (cue != cue.round()).any() else [len(column.unique()) for column in cue.T]
     report["cue_chance"] = float(np.mean([1 / n for n in classes])) if classes else 0.0
     return report
-
-
-def plot_diagnostics(report: dict, title: str) -> bytes:
-    """Draw the report as a PNG: the cue's read-out and the reconstruction of u against time."""
-    matplotlib.use("Agg")
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
-    left.plot(report["cue_from_u"], "k:", label="from u itself")
-    left.plot(report["cue_from_h"], "C0-", label="from h")
-    left.plot(report["cue_from_particle"], "C1--", label="from the mean particle")
-    left.axhline(report["cue_chance"], color="grey", linestyle="-.", label="chance")
-    left.set(xlabel="step", ylabel="held-out accuracy, or R2", title="cue, linear read-out", ylim=(-0.5, 1.05))
-    right.plot(report["u_r2_posterior"], "k:", label="posterior (sees u)")
-    right.plot(report["u_r2_prior"], "C1-", label="prior (mean particle)")
-    right.set(xlabel="step", ylabel="R2", title="reconstruction of u", ylim=(-0.5, 1.05))
-    for axes in (left, right):
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, frameon=False)
-    figure.suptitle(f"{title}: action read-out R2 {report['action_readout']:.3f}")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
 
 
 def success_and_return(data: dict[str, torch.Tensor]) -> dict[str, float]:
@@ -582,15 +570,17 @@ def make_video(data: dict[str, torch.Tensor]) -> bytes:
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1)
 
 
-def evaluate_with_belief(envs: gym.Env, agent: BeliefAgent, args: Args, known: dict) -> tuple[dict[str, float], bytes]:
+def evaluate_with_belief(
+    envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, readout_data: dict[str, torch.Tensor]
+) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    cue_readout: how well a read-out fitted on known, mean particles and cues under random actions, tells the cue here.
+    cue_readout: cue (M, K) from mean particle (M, u_dim), fitted on readout_data, random actions', and tested here.
     """
     torch.manual_seed(0)
     data = rollout_with_belief(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), explore=False)
     particle, cue = data["particles"].mean(-2).flatten(0, 1), data["cue"].flatten(0, 1)
-    cue_readout = readout_score(known["particle"], known["cue"], particle, cue)
+    cue_readout = readout_score(readout_data["particle"], readout_data["cue"], particle, cue)
     return {**success_and_return(data), "cue_readout": cue_readout}, make_video(data)
 
 
@@ -602,7 +592,7 @@ def train_belief(args: Args, path: Path) -> None:
     device = torch.device(args.device)
     episodes, stored = load_episodes(args)
     # of the held-out episodes, read-outs are fitted on one half and tested on the other
-    train, fit_on, test_on = np.split(np.arange(len(episodes.u)), [-stored["num_val"], -(stored["num_val"] // 2)])
+    train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-stored["num_val"], -(stored["num_val"] // 2)])
     sample = episodes(train[:1])
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
     config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints, "u_dim": stored["u_dim"]}
@@ -613,11 +603,12 @@ def train_belief(args: Args, path: Path) -> None:
     if args.chrono_init:
         chrono_init(history.gru, len(sample["actions"]))
     if args.image_norm == "mean":
-        history.image_mean, history.image_std = stored["psi"]["image_mean"], stored["psi"]["image_std"]
+        history.image_mean, history.image_std = stored["norm"]["image_mean"], stored["norm"]["image_std"]
     if args.history_joints:
-        history.joints_mean, history.joints_std = stored["psi"]["joints_mean"], stored["psi"]["joints_std"]
-    ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX: glibc keeps large tensors instead of asking for them anew,
-    ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: an update is a third faster on a CPU
+        history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
+    # glibc keeps freed memory instead of asking for it anew: an update is a third faster on a CPU
+    ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
+    ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first = 0
@@ -659,12 +650,17 @@ def train_belief(args: Args, path: Path) -> None:
     # the last weights: held-out error and likelihood are best before the belief remembers
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = diagnose_belief(fit, test)
-    cue = fit["cue"].unsqueeze(1).expand(-1, fit["u"].shape[1], -1)  # for eval/cue_readout of PPO
-    known = {"particle": fit["particle"][:, ::8].flatten(0, 1), "cue": cue[:, ::8].flatten(0, 1)}
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
-    save(path / "diagnostics.png", plot_diagnostics(report, f"{args.env_id}, {args.exp_name}"))
-    content = {"kind": "believer_belief", "config": config, "known": known}
+    some = fit["particle"][:, ::8]  # every 8th step is enough
+    readout_data = {"particle": some.flatten(0, 1), "cue": fit["cue"].repeat_interleave(some.shape[1], 0)}
+    content = {"kind": "believer_belief", "config": config, "readout_data": readout_data}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
+    for name, values in report.items():  # curves over an episode's steps
+        for step, value in enumerate(values if isinstance(values, list) else []):
+            writer.add_scalar(f"by_time_step/{name}", value, step)
+    writer.close()
+    known = [f"{name} {report[name][-1]:.2f}" for name in ("cue_from_u", "cue_from_particle", "u_r2_prior")]
+    print(f"{path / 'belief.pt'}, at the last step of held-out episodes: {', '.join(known)}")
 
 
 def main(args: Args) -> None:
@@ -674,14 +670,15 @@ def main(args: Args) -> None:
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_believer agent")
         for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
             setattr(args, name, stored[name])
-    check_task(args)
-    path = file.parent if args.evaluate else open_run(args)
-    resume = not args.evaluate and (path / "checkpoint.pt").exists()
-    checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
-    if checkpoint.get("finished"):
-        print(f"{path} is finished; --overwrite makes it anew")
-        return
-    if not args.evaluate:
+        check_task(args)
+    else:
+        check_task(args)
+        path = open_run(args)
+        resume = (path / "checkpoint.pt").exists()
+        checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
+        if checkpoint.get("finished"):
+            print(f"{path} is finished; --overwrite makes it anew")
+            return
         if not (path / "belief.pt").exists():
             train_belief(args, path)
             torch.cuda.empty_cache()  # the simulator needs the GPU's memory too
@@ -694,9 +691,9 @@ def main(args: Args) -> None:
     agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
     if args.evaluate:
         agent.load_state_dict(stored["agent"])
-        metrics, video = evaluate_with_belief(envs, agent, args, stored["known"])
-        save(path / "evaluation.json", json.dumps(metrics, indent=2).encode())
-        save(path / "evaluation.mp4", video)
+        metrics, video = evaluate_with_belief(envs, agent, args, stored["readout_data"])
+        save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
+        save(file.with_name("evaluation.mp4"), video)
         print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
         return
 
@@ -741,14 +738,14 @@ def main(args: Args) -> None:
         del data, batch, losses  # a gigabyte of images and a graph: not two at a time
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
-            metrics, video = evaluate_with_belief(envs, agent, args, stored["known"])
+            metrics, video = evaluate_with_belief(envs, agent, args, stored["readout_data"])
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
             metrics.pop("cue_readout")  # the columns of eval.csv are those of plain PPO
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
             lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"config": stored["config"], "known": stored["known"], "agent": agent.state_dict()}
+            content = {"config": stored["config"], "readout_data": stored["readout_data"], "agent": agent.state_dict()}
             content |= {"kind": "ppo_believer agent", "global_step": global_step}
             save(path / "agent.pt", {**asdict(args), **content})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
@@ -773,7 +770,7 @@ class TaskView(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and the task's other facts.
     """
 
     def __init__(self, env: gym.Env):

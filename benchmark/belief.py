@@ -24,7 +24,7 @@ import tyro
 ROOT = Path(__file__).parent.parent
 sys.path += [str(ROOT), str(ROOT / "tests")]
 import aib_belief  # noqa: E402
-from per_step_loop import PerStepHistory  # noqa: E402
+from per_step_loop import encode_history_per_step  # noqa: E402
 
 ROWS = {  # what follows --small
     "flow": [],
@@ -90,12 +90,13 @@ def speed(device: torch.device) -> str:
     batch = {"rgb": torch.randint(0, 256, (steps + 1, episodes, 128, 128, 3), dtype=torch.uint8, device=device)}
     batch |= {"u": torch.randn(steps + 1, episodes, 16, device=device)}
     batch |= {"actions": torch.rand(steps, episodes, 8, device=device) * 2 - 1}
-    whole, per_step = model["belief"].history, PerStepHistory(model["belief"].history).to(device)
+    batch["joints"] = torch.zeros(steps + 1, episodes, 25, device=device)
+    whole, per_step = aib_belief.encode_history, encode_history_per_step
     variants = {"per-step loop": (per_step, False), "whole float32": (whole, False), "whole bfloat16": (whole, True)}
     seconds = {name: [] for name in variants}
     for repeat in range(6):
-        for name, (history, amp) in variants.items():
-            model["belief"].history, whole.cnn.amp = history, amp
+        for name, (encode_history, amp) in variants.items():
+            aib_belief.encode_history, model["belief"].history.cnn.amp = encode_history, amp
             start = time.time()
             loss = aib_belief.belief_losses(model, batch, aib_belief.Args())["total"]
             optimizer.zero_grad()

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn as nn
 import tyro
 
 ROOT = Path(__file__).parent.parent
@@ -50,16 +49,18 @@ def main(args: Args) -> None:
     stored_repr = torch.load(repr_dir / "repr.pt", weights_only=True)
     phi = aib_belief.StateEncoder(len(stored_repr["phi"]["mean"]), stored_repr["u_dim"])
     phi.load_state_dict(stored_repr["phi"])
-    model = nn.ModuleDict({"belief": aib_belief.AIBBelief(stored["config"])})
-    model["posterior"] = aib_belief.GaussianMLP(stored_repr["u_dim"] + 256, [256, 256], stored["z_dim"], min_std=0.1)
-    model.load_state_dict({name: x for name, x in stored["training"].items() if not name.startswith("head")})
+    belief = aib_belief.AIBBelief(stored["config"])
+    belief.load_state_dict(stored["belief"])
+    posterior = aib_belief.GaussianMLP(
+        stored_repr["u_dim"] + 256, [256, 256], stored["z_dim"], min_std=0.1
+    )  # not looked at
 
     def encode(path: Path, count: int) -> dict[str, torch.Tensor]:
         """aib_belief.encode of the last episodes of a dataset."""
-        state, cue = (torch.from_numpy(np.load(path / "dataset" / f"{name}.npy")) for name in ("state", "cue"))
+        state = torch.from_numpy(np.load(path / "dataset" / "state.npy"))
         with torch.no_grad():
-            episodes = aib_belief.Episodes(path / "dataset", phi(state).mean, cue, torch.device("cpu"))
-        return aib_belief.encode(model["belief"], model["posterior"], episodes, np.arange(len(state))[-count:])
+            episodes = aib_belief.Episodes(path / "dataset", phi(state).mean, torch.device("cpu"))
+        return aib_belief.encode(belief, posterior, episodes, np.arange(len(state))[-count:])
 
     fit = encode(repr_dir, stored_repr["num_val"])
     report = {}

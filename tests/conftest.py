@@ -1,6 +1,8 @@
 """What the tests share: a command line, the toy task in the simulator's place, and one small real run of everything."""
 
 import os
+
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # the tests are for the CPU, where runs repeat to the last bit
 import subprocess
 import sys
 from pathlib import Path
@@ -52,7 +54,7 @@ def toy_stages(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.chdir(folder)
         toy.take_the_simulators_place(patch.setattr, aib_repr)
         aib_repr.main(aib_repr.Args(env_id=TOY, num_episodes=20, val_share=0.25, epochs=1, batch_size=50))
-        aib_belief.main(aib_belief.Args(env_id=TOY, num_updates=3, batch_episodes=4))
+        aib_belief.main(aib_belief.Args(env_id=TOY, num_episodes=20, num_updates=3, batch_episodes=4))
     return folder / "runs"
 
 

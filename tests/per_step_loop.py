@@ -6,21 +6,16 @@ import torch.nn as nn
 import aib_belief
 
 
-class PerStepHistory(nn.Module):
-    """The same h as aib_belief.HistoryEncoder from the same weights (one layer, images only), step by step."""
-
-    def __init__(self, history: aib_belief.HistoryEncoder):
-        super().__init__()
-        self.history = history
-        self.cell = nn.GRUCell(history.gru.input_size, history.gru.hidden_size)
-        for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
-            setattr(self.cell, name, getattr(history.gru, name + "_l0"))
-
-    def forward(self, batch: dict[str, torch.Tensor], **_: object) -> tuple[torch.Tensor, None]:
-        """rgb (T, B, H, W, 3) uint8 -> h (T, B, 256)."""
-        state, outputs = None, []
-        for rgb in batch["rgb"]:
-            x = self.history.cnn((rgb.float() - self.history.image_mean) / self.history.image_std)
-            state = self.cell(x, state)
-            outputs.append(self.history.out(torch.cat([state, x], -1)))
-        return torch.stack(outputs), None
+def encode_history_per_step(
+    history: aib_belief.HistoryEncoder, batch: dict[str, torch.Tensor], bptt_steps: None = None
+) -> torch.Tensor:
+    """aib_belief.encode_history from the same weights, of one GRU layer and images only."""
+    cell = nn.GRUCell(history.gru.input_size, history.gru.hidden_size)
+    for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
+        setattr(cell, name, getattr(history.gru, name + "_l0"))
+    state, outputs = None, []
+    for rgb in batch["rgb"]:
+        x = history.cnn((rgb.float() - history.image_mean) / history.image_std)
+        state = cell(x, state)
+        outputs.append(history.out(torch.cat([state, x], -1)))
+    return torch.stack(outputs)

@@ -16,19 +16,19 @@ import aib_repr
 import ppo_aib
 import ppo_believer
 from conftest import ROOT, TOY, train
-from per_step_loop import PerStepHistory
+from per_step_loop import encode_history_per_step
 
 
 def test_whole_sequences_give_what_a_per_step_loop_gives() -> None:
     torch.manual_seed(0)
     config = {"image_shape": [36, 36, 3], "joints_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
     history = aib_belief.HistoryEncoder(config)
-    batch = {"rgb": torch.randint(0, 256, (8, 3, 36, 36, 3), dtype=torch.uint8)}
-    assert torch.allclose(history(batch)[0], PerStepHistory(history)(batch)[0], atol=1e-5)
+    batch = {"rgb": torch.randint(0, 256, (8, 3, 36, 36, 3), dtype=torch.uint8), "joints": torch.zeros(8, 3, 7)}
+    h = aib_belief.encode_history(history, batch)
+    assert torch.allclose(h, encode_history_per_step(history, batch), atol=1e-5)
     history.cnn.amp = True
-    low = history(batch)[0]
-    history.cnn.amp = False
-    assert low.dtype == torch.float32 and torch.allclose(low, history(batch)[0], atol=0.05), "bfloat16 only roughly"
+    low = aib_belief.encode_history(history, batch)
+    assert low.dtype == torch.float32 and torch.allclose(low, h, atol=0.05), "bfloat16 only roughly"
 
 
 def make_stage_1(folder: Path, episodes: int) -> int:
@@ -45,7 +45,8 @@ def make_stage_1(folder: Path, episodes: int) -> int:
         np.save(path / "dataset" / f"{name}.npy", array.astype(np.float32))
     content = {"kind": "repr", "env_id": TOY, "robot": "panda_wristcam", "mesh_triangles": 500, "num_val": 8}
     phi, psi = aib_repr.StateEncoder(4, 4), aib_repr.ObservationEncoder([128, 128, 3], 3, 4)
-    aib_repr.save(path / "repr.pt", {**content, "u_dim": 4, "phi": phi.state_dict(), "psi": psi.state_dict()})
+    content |= {"num_episodes": episodes, "u_dim": 4, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())}
+    aib_repr.save(path / "repr.pt", content)
     return rgb.nbytes
 
 
@@ -54,7 +55,8 @@ def test_peak_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path) -
     for episodes in (560, 1600):
         folder = tmp_path / str(episodes)
         sizes.append(make_stage_1(folder, episodes))
-        code = "import sys, aib_belief as b; b.main(b.Args(env_id=sys.argv[1], num_updates=3, batch_episodes=4))"
+        sizes_of_run = f"num_episodes={episodes}, num_updates=3, batch_episodes=4"
+        code = f"import sys, aib_belief as b; b.main(b.Args(env_id=sys.argv[1], {sizes_of_run}))"
         # not ru_maxrss: a child inherits its parent's
         code += "; print('PEAK', open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"
         env = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -76,7 +78,7 @@ def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_
 
     monkeypatch.setattr(aib_belief, "encode", recorded)
     repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
-    path = train(aib_belief, repr_dir=repr_dir, num_updates=6, batch_episodes=4, held_out_every=2)
+    path = train(aib_belief, repr_dir=repr_dir, num_episodes=20, num_updates=6, batch_episodes=4, held_out_every=2)
     fit, test = [15, 16, 17], [18, 19]  # of 20 episodes, a quarter of which is held out
     assert [episodes for episodes, _ in looks] == [test] * 3 + [fit, test]
     stored = torch.load(path / "belief.pt", weights_only=True)["belief"]

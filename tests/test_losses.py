@@ -114,7 +114,7 @@ def test_elbo_terms_are_the_closed_forms() -> None:
     assert torch.equal(mean, q.mean) and nll.shape == kl.shape == (T, B)
 
 
-@pytest.mark.parametrize("tau", [0.0, 1.0])
+@pytest.mark.parametrize("tau", [0.0, 0.3, 1.0])
 def test_flow_matching_interpolates_from_noise_to_action(tau: float) -> None:
     seen, action, noise = [], torch.rand(B, A), torch.randn(B, A)
     z, z_next = torch.randn(B, 5), torch.randn(B, 5)
@@ -124,7 +124,8 @@ def test_flow_matching_interpolates_from_noise_to_action(tau: float) -> None:
         return torch.zeros(B, A)
 
     loss = aib_belief.flow_matching_loss(head, action, z, z_next, noise, torch.full((B, 1), tau))
-    assert torch.allclose(seen[0], torch.cat([action if tau else noise, torch.full((B, 1), tau), z, z_next], -1))
+    a_tau = (1 - tau) * noise + tau * action
+    assert torch.allclose(seen[0], torch.cat([a_tau, torch.full((B, 1), tau), z, z_next], -1))
     assert torch.allclose(loss, ((action - noise) ** 2).sum(-1))
 
 
@@ -138,18 +139,22 @@ def test_total_loss_adds_up_and_ablations_leave_their_term_out() -> None:
         assert torch.allclose(losses["total"], total)
 
 
-@pytest.mark.parametrize("latent", ["mean", "sample"])
-def test_what_the_action_head_sees_of_the_posterior(latent: str) -> None:
-    model, batch = belief_model(), belief_batch()
+@pytest.mark.parametrize("head, latent", [("flow", "mean"), ("flow", "sample"), ("mse", "mean")])
+def test_what_the_action_head_sees_of_the_posterior(head: str, latent: str) -> None:
+    model, batch = belief_model(head), belief_batch()
     torch.manual_seed(2)
-    loss = aib_belief.belief_losses(model, batch, losses_args(fm_latent=latent))["action"]
+    loss = aib_belief.belief_losses(model, batch, losses_args(action_head=head, fm_latent=latent))["action"]
     torch.manual_seed(2)
-    q = model["posterior"](torch.cat([batch["u"], model["belief"].history(batch)[0]], -1))
+    h = aib_belief.encode_history(model["belief"].history, batch)
+    q = model["posterior"](torch.cat([batch["u"], h], -1))
     sample, action = q.rsample(), batch["actions"]
     z = {"mean": q.mean, "sample": sample}[latent]
     noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
-    expected = aib_belief.flow_matching_loss(model["head"], action, z[:-1], z[1:], noise, tau).mean()
-    assert torch.allclose(loss, expected)
+    expected = {
+        "flow": lambda: aib_belief.flow_matching_loss(model["head"], action, z[:-1], z[1:], noise, tau).mean(),
+        "mse": lambda: (model["head"](torch.cat([z[:-1], z[1:]], -1)) - action).square().sum(-1).mean(),
+    }
+    assert torch.allclose(loss, expected[head]())
 
 
 def test_flow_loss_shapes_the_posterior_and_the_prior_only_through_the_kl() -> None:
@@ -188,11 +193,11 @@ def test_particles_are_draws_from_prior_and_decoder() -> None:
     for t in range(2):
         seen = {name: batch[name][t] for name in ("rgb", "joints")}
         drawn, memory = agent.draw_particles(seen, memory, z_noise, u_noise)
-    h, _ = belief.history({name: batch[name][:2] for name in ("rgb", "joints")})
-    p = belief.prior(h[1])
+    h = aib_belief.encode_history(belief.history, batch)[1]
+    p = belief.prior(h)
     assert drawn.shape == (B, 30, 4)
     for i in (0, 29):
-        d = belief.decoder(torch.cat([p.mean + p.stddev * z_noise[:, i], h[1]], -1))
+        d = belief.decoder(torch.cat([p.mean + p.stddev * z_noise[:, i], h], -1))
         assert torch.allclose(drawn[:, i], d.mean + d.stddev * u_noise[:, i], atol=1e-5)
 
 
@@ -202,7 +207,7 @@ def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
     seen = aib_belief.encode(belief, posterior, lambda index: batch, np.arange(B))
     torch.manual_seed(0)
     with torch.no_grad():
-        h, _ = belief.history(batch)
+        h = aib_belief.encode_history(belief.history, batch)
         aib_belief.elbo_terms(belief, posterior, batch["u"], h)  # draws its noise first
         p, noise = belief.prior(h), torch.randn(T + 1, B, 30, 5)
         density, means = torch.zeros(T + 1, B), torch.zeros(T + 1, B, 4)
@@ -214,15 +219,12 @@ def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
     assert torch.allclose(seen["particle"], means.transpose(0, 1), atol=1e-5)
 
 
-@pytest.mark.parametrize("layers, joints", [(1, 0), (2, 7)])
-def test_sequence_and_step_path_agree(layers: int, joints: int) -> None:
-    config = {**CONFIG, "gru_layers": layers, "joints_dim": joints}
-    history, batch = belief_model(config=config)["belief"].history, belief_batch()
-    whole, _ = history(batch)
-    state = None
+def test_sequence_and_step_path_agree() -> None:
+    history = belief_model(config={**CONFIG, "gru_layers": 2, "joints_dim": 7})["belief"].history
+    batch, memory = belief_batch(), None
+    whole = aib_belief.encode_history(history, batch)
     for t in range(T + 1):
-        now = {name: batch[name][t : t + 1] for name in ("rgb", "joints")}
-        h, state = history(now, state)
+        h, memory = history(history.embed(batch["rgb"][t], batch["joints"][t])[None], memory)
         assert torch.allclose(h[0], whole[t], atol=1e-5)
 
 
@@ -231,7 +233,7 @@ def gradient_of_first_frame(bptt_steps: int | None, steps: int = 59) -> torch.Te
     history, batch = belief_model()["belief"].history, belief_batch(steps)
     kept = []
     handle = history.cnn.register_forward_hook(lambda module, x, y: (y.retain_grad(), kept.append(y))[1])
-    h, _ = history(batch, bptt_steps=bptt_steps)
+    h = aib_belief.encode_history(history, batch, bptt_steps)
     handle.remove()
     h[-1].sum().backward()
     return kept[0].grad.view(steps + 1, B, -1)[0]
@@ -255,10 +257,11 @@ def test_chunks_of_frames_give_the_same_gradients(monkeypatch: pytest.MonkeyPatc
 
 def test_joints_enter_the_history_standardised() -> None:
     history, batch = belief_model(config={**CONFIG, "joints_dim": 7})["belief"].history, belief_batch()
-    plain, _ = history(batch)
+    plain = aib_belief.encode_history(history, batch)
     history.joints_mean.fill_(3.0)
     history.joints_std.fill_(2.0)
-    assert torch.allclose(history({**batch, "joints": batch["joints"] * 2 + 3})[0], plain, atol=1e-5)
+    batch["joints"] = batch["joints"] * 2 + 3
+    assert torch.allclose(aib_belief.encode_history(history, batch), plain, atol=1e-5)
 
 
 def test_chrono_initialisation_sets_the_update_gate() -> None:
@@ -290,7 +293,7 @@ def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> N
     rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.zeros(2, 7)
     for encoder, encode in (
         (psi, lambda x: psi(x, joints).mean),
-        (history, lambda x: history({"rgb": x[None]})[0]),
+        (history, lambda x: history.embed(x, joints)),
     ):
         plain = encode(rgb)
         encoder.image_mean, encoder.image_std = torch.full(IMAGE, 50.0), torch.tensor(255.0)
@@ -365,19 +368,18 @@ def test_gae_is_the_double_sum() -> None:
         assert torch.allclose(advantages[t], direct, atol=1e-5)
 
 
-def test_belief_aggregator_is_the_papers_formula_and_ignores_the_order_of_particles() -> None:
+def test_belief_aggregator_is_the_papers_formula() -> None:
     torch.manual_seed(0)
     agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG), 7, A, 0.6)
     obs = {"rgb": torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8), "joints": torch.randn(B, 7)}
     particles = torch.randn(B, 30, 4)
     policy, value = agent({**obs, "particles": particles})
-    again, value_again = agent({**obs, "particles": particles.flip(1)})
     assert policy.mean.shape == (B, A) and value.shape == (B,)
-    assert torch.allclose(policy.mean, again.mean, atol=1e-6) and torch.allclose(value, value_again, atol=1e-6)
     belief = agent.w_agg(torch.stack([agent.w_enc(particles[:, i]) for i in range(30)]).mean(0))
     image, joints = agent.cnn(obs["rgb"].float() / 255), agent.joints(obs["joints"])
     x = torch.cat([image, joints, belief], -1)
     assert torch.allclose(policy.mean, torch.tanh(agent.actor(x)), atol=1e-6)
+    assert torch.allclose(value, agent.critic(x)[:, 0], atol=1e-6)
 
 
 def test_ppo_losses_are_the_closed_forms() -> None:
