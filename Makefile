@@ -1,9 +1,9 @@
 # make run: set everything up, then train AIB on InterceptFast (a --quick trial where there is no CUDA device)
 # make demo: set everything up, then train AIB on RememberColor3 with --small, for hours, and draw its curve
 # make test: set everything up, then lint and run the tests
-# make test-all: the same with every kill of every stage and three seeds of the learning test
+# make test-all: all tests, with every kill of every stage and three seeds of the learning test
 # make bench: speed and memory, as ratios measured in one run
-# make bench-belief: train the belief and its ablations on RememberColor3 and print what each remembers
+# make bench-belief: train the belief, one without action head and Believer's on RememberColor3; what each remembers
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .ONESHELL:

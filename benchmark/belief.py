@@ -8,7 +8,6 @@ Usage:   python benchmark/belief.py                                  (RememberCo
 """
 
 import ctypes
-import json
 import statistics
 import subprocess
 import sys
@@ -16,13 +15,14 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn as nn
 import tyro
 
 ROOT = Path(__file__).parent.parent
 sys.path += [str(ROOT), str(ROOT / "tests")]
+import report  # noqa: E402
+
 import aib_belief  # noqa: E402
 from per_step_loop import encode_history_per_step  # noqa: E402
 
@@ -44,15 +44,6 @@ path = b.open_run(args)
 if not (path / "belief.pt").exists():
     b.train_belief(args, path)
 """
-COLUMNS = {
-    "cue from h": "cue_from_h",
-    "cue from particle": "cue_from_particle",
-    "R2 of u, particle": "u_r2_prior",
-    "nll prior": "nll_prior",
-    "nll posterior": "nll_posterior",
-    "action R2": "action_readout",
-    "flow gain": "flow_gain",
-}
 
 
 @dataclass
@@ -67,13 +58,11 @@ class Args:
     """compare stage 2's update with a per-step GRUCell loop"""
 
 
-def run(command: list[str]) -> float:
-    """Run a command with its progress showing; returns the seconds it took."""
-    start = time.time()
+def run(command: list[str]) -> None:
+    """Run a command with its progress showing."""
     code = subprocess.run([sys.executable, *command]).returncode
     if code:
         sys.exit(code)
-    return time.time() - start
 
 
 def speed(device: torch.device) -> str:
@@ -110,20 +99,8 @@ def speed(device: torch.device) -> str:
     return f"stage-2 update, {episodes} episodes x {steps} steps, against a per-step loop in float32: {ratios}"
 
 
-def cell(reports: list[dict], key: str, steps: list[int]) -> str:
-    """One entry of the table, by steps where there are: mean over seeds, with their sample deviation from two on."""
-    if key not in reports[0]:
-        return "-"
-    columns = zip(*([r[key][t] for t in steps] if isinstance(r[key], list) else [r[key]] for r in reports), strict=True)
-    return " / ".join(
-        f"{np.mean(column):.2f} ± {np.std(column, ddof=1):.2f}" if len(column) > 1 else f"{column[0]:.2f}"
-        for column in columns
-    )
-
-
 def main(args: Args) -> None:
     """Run what is missing and print the table."""
-    reports, took = {row: [] for row in args.rows}, dict.fromkeys(args.rows, 0.0)
     for seed in args.seeds:
         base = ["--env-id", args.env_id, "--seed", str(seed), "--small"]
         run([str(ROOT / "aib_repr.py"), *base])
@@ -132,21 +109,9 @@ def main(args: Args) -> None:
             name = "ppo_believer_small" if row == "believer" else name
             script = ["-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}){BELIEVER}"]
             script = script if row == "believer" else [str(ROOT / "aib_belief.py")]
-            took[row] += run([*script, *base, "--exp-name", name, *ROWS[row]])
-            path = Path("runs") / f"{args.env_id}__{name}__{seed}"
-            reports[row].append(json.loads((path / "diagnostics.json").read_text()))
-    first = reports[args.rows[0]]
-    steps = [4, 9, 30, len(first[0]["u_r2_prior"]) - 2]
+            run([*script, *base, "--exp-name", name, *ROWS[row]])
+    print(report.belief_table(args.env_id, report.read_beliefs(Path("runs"))[args.env_id]))
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    print(
-        f"\n{args.env_id}, --small, {len(args.seeds)} seeds, torch {torch.__version__} on {device}; steps {steps}; ",
-        end="",
-    )
-    print(f"cue: chance {first[0]['cue_chance']:.2f}, from u {cell(first, 'cue_from_u', steps)}\n")
-    print("| belief | " + " | ".join(COLUMNS) + " | seconds |\n|" + "---|" * (len(COLUMNS) + 2))
-    for row, found in reports.items():
-        cells = [cell(found, key, steps) for key in COLUMNS.values()]
-        print(f"| {row} | " + " | ".join(cells) + f" | {took[row]:.0f} |")
     if args.speed:
         print(speed(torch.device(device)))
 

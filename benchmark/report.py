@@ -1,10 +1,11 @@
 """Tables 1, 6, 7, 8 and Figures 2, 3, 4, 8 of the paper from finished runs, beside the paper's own numbers.
 
-With --small, one table and one figure of the three methods' --small runs, on whatever tasks there are.
+With --small, the --small runs on whatever tasks there are: a table and a figure of the three methods, and a table and a
+figure of what their beliefs remember.
 
 Usage:   python benchmark/report.py                 (reads runs/, writes benchmark/report/)
          python benchmark/report.py --small --runs benchmark/results --output benchmark/results   (the README's figure)
-Reads:   {runs}/{env_id}__{exp_name}__{seed}/ of the PPO scripts: args.json, eval.csv
+Reads:   {runs}/{env_id}__{exp_name}__{seed}/: args.json; eval.csv of the PPO scripts, diagnostics.json of the beliefs
 Writes:  {output}/report.md (small.md) and PNG figures
 """
 
@@ -31,6 +32,22 @@ TASKS = {
 METHODS = {"ppo_aib": "AIB", "ppo_believer": "Believer", "ppo_baseline": "PPO"}
 COLOURS = {"ppo_aib": "tab:red", "ppo_believer": "tab:blue", "ppo_baseline": "tab:green"}
 HEADS = {"ppo_aib": "flow matching", "ppo_aib_none": "no action head", "ppo_aib_mse": "MSE regression"}
+BELIEFS = {
+    "aib_belief_small": "AIB, flow matching",
+    "aib_belief_small_mse": "AIB, MSE regression",
+    "aib_belief_small_none": "AIB, no action head",
+    "ppo_believer_small": "Believer",
+}
+BELIEF_COLUMNS = {  # of diagnostics.json
+    "cue from h": "cue_from_h",
+    "cue from the mean particle": "cue_from_particle",
+    "R² of u, mean particle": "u_r2_prior",
+    "−log p(u), prior": "nll_prior",
+    "posterior": "nll_posterior",
+    "R² of a_t": "action_readout",
+    "L_FM": "flow_loss",
+    "flow gain": "flow_gain",
+}
 LAMBDAS = {"ppo_aib": "λ = 1", "ppo_aib_lambda_0.1": "λ = 0.1", "ppo_aib_lambda_0.01": "λ = 0.01"}
 PAPER = {  # (column of eval.csv, statistic): {task: (AIB, Believer, PPO)}
     ("success_once", "last"): {
@@ -154,8 +171,66 @@ def main_table(runs: dict, key: tuple[str, str]) -> str:
     return "\n".join(lines)
 
 
-def small_report(runs: dict, output: Path) -> None:
-    """small.md and small.png: every task that any of the three methods was run on with --small."""
+def read_beliefs(folder: Path) -> dict[str, dict[str, list[dict]]]:
+    """diagnostics.json of every --small belief below folder, a list over seeds by task and by what was trained."""
+    found = defaultdict(lambda: {label: [] for label in BELIEFS.values()})
+    for file in sorted(folder.glob("*_small*__*/diagnostics.json")):
+        args = json.loads((file.parent / "args.json").read_text())
+        other = f"AIB, {args['exp_name'].removeprefix('aib_belief_small_').replace('_', ' ')}"
+        rows = found[args["env_id"]]
+        rows.setdefault(BELIEFS.get(args["exp_name"], other), []).append(json.loads(file.read_text()))
+    return {task: {label: reports for label, reports in rows.items() if reports} for task, rows in found.items()}
+
+
+def belief_cell(reports: list[dict], column: str) -> str:
+    """Numbers by step where there are such, mean over seeds and from two on their sample deviation."""
+    if column not in reports[0]:
+        return "–"
+    values = [r[column] if isinstance(r[column], list) else [r[column]] for r in reports]
+    steps = [4, 9, 30, -1] if len(values[0]) > 1 else [0]
+    cells = []
+    for step in steps:
+        x = np.array([row[step] for row in values])
+        cells.append(f"{x.mean():.2f}" + (f" ± {x.std(ddof=1):.2f}" if len(x) > 1 else ""))
+    return " / ".join(cells)
+
+
+def belief_table(task: str, rows: dict[str, list[dict]]) -> str:
+    """What the beliefs of one task remember of held-out episodes, in Markdown."""
+    first = next(iter(rows.values()))[0]
+    head = f"{task}: steps 4 / 9 / 30 / last; cue: chance {first['cue_chance']:.2f}"
+    lines = [
+        head,
+        "",
+        "| belief | seeds | " + " | ".join(BELIEF_COLUMNS) + " |",
+        "|" + "---|" * (len(BELIEF_COLUMNS) + 2),
+    ]
+    for label, reports in rows.items():
+        cells = [belief_cell(reports, column) for column in BELIEF_COLUMNS.values()]
+        lines.append(f"| {label} | {len(reports)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def belief_figure(beliefs: dict, path: Path) -> None:
+    """Cue and R² of u from the mean particle against the time step, a column per task, means over seeds."""
+    figure, axes = plt.subplots(
+        2, len(beliefs), figsize=(5 * len(beliefs) + 1, 6.5), layout="constrained", squeeze=False
+    )
+    for column, (task, rows) in zip(axes.T, beliefs.items(), strict=True):
+        for ax, name, title in zip(column, ("cue_from_particle", "u_r2_prior"), ("cue", "R² of u"), strict=True):
+            for label, reports in rows.items():
+                ax.plot(np.mean([report[name] for report in reports], 0), label=f"{label} ({len(reports)})")
+            ax.set(xlabel="step", ylabel=f"{title}, from the mean particle", ylim=(-0.3, 1.05))
+            ax.grid(alpha=0.3)
+        column[0].axhline(reports[0]["cue_chance"], color="grey", linestyle="--", label="chance")
+        column[0].set_title(task)
+        column[0].legend(fontsize=8, loc="lower left")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def small_report(runs: dict, beliefs: dict, output: Path) -> None:
+    """small.md, small.png and belief.png: every task that was run with --small."""
     tasks = sorted({task for task, _ in runs})
     lines = ["# Runs with --small", "", "| task | measure | " + " | ".join(METHODS.values()) + " |", "|" + "---|" * 5]
     figure, axes = plt.subplots(1, len(tasks), figsize=(5 * len(tasks) + 1, 4), layout="constrained", squeeze=False)
@@ -168,7 +243,12 @@ def small_report(runs: dict, output: Path) -> None:
             draw(ax, runs.get((task, f"{method}_small")), "success_once", label, COLOURS[method])
         ax.set_title(task)
     finish(figure, axes[0], "success_once", output / "small.png")
-    (output / "small.md").write_text("\n".join(lines) + "\n\n![success_once](small.png)\n")
+    lines += ["", "![success_once](small.png)", ""]
+    if beliefs:
+        belief_figure(beliefs, output / "belief.png")
+        lines += ["# What the beliefs remember", "", "![cue and u from the mean particle](belief.png)"]
+        lines += ["\n" + belief_table(task, rows) for task, rows in beliefs.items()]
+    (output / "small.md").write_text("\n".join(lines) + "\n")
     print(f"{output / 'small.md'}: {', '.join(tasks)}")
 
 
@@ -221,7 +301,7 @@ def main(args: Args) -> None:
         sys.exit(2)
     args.output.mkdir(parents=True, exist_ok=True)
     if args.small:
-        small_report(runs, args.output)
+        small_report(runs, read_beliefs(args.runs), args.output)
         return
     for column, name in (("success_once", "figure_2.png"), ("success_at_end", "figure_8.png")):
         figure, axes = plt.subplots(1, 4, figsize=(18, 4), layout="constrained")
