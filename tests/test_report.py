@@ -49,6 +49,13 @@ def test_small_runs_of_any_task(tmp_path: Path) -> None:
         shutil.copytree(RECORDED / f"RememberShapeAndColor3x2-v0__ppo_aib__{seed}", run)
         args = json.loads((run / "args.json").read_text())
         (run / "args.json").write_text(json.dumps({**args, "env_id": "X-v0", "exp_name": "ppo_aib_small"}))
+    for seed, cue in ((1, 0.5), (2, 0.7)):
+        run = tmp_path / f"X-v0__aib_belief_small__{seed}"
+        run.mkdir()
+        (run / "args.json").write_text(json.dumps({"env_id": "X-v0", "exp_name": "aib_belief_small"}))
+        lists = {name: [0.0] * 40 + [cue] for name in ("cue_from_h", "cue_from_particle", "u_r2_prior")}
+        numbers = dict.fromkeys(("cue_chance", "nll_prior", "nll_posterior", "action_readout"), 2 * cue)
+        (run / "diagnostics.json").write_text(json.dumps(lists | numbers))
     report.main(report.Args(runs=tmp_path, output=tmp_path, small=True))
     text = (tmp_path / "small.md").read_text()
     values = "0.63 ± 0.15 (3 seeds), IQM 0.62 [0.50, 0.80]"
@@ -56,6 +63,10 @@ def test_small_runs_of_any_task(tmp_path: Path) -> None:
         f"| X-v0 | success_once, mean of the last three | {values} | missing | missing |" in text
         and iio.imread(tmp_path / "small.png").std() > 10
     )
+    by_step = "0.00 ± 0.00 / 0.00 ± 0.00 / 0.00 ± 0.00 / 0.60 ± 0.14"
+    numbers = " | ".join(["1.20 ± 0.28"] * 3)
+    assert f"| AIB, flow matching | 2 | {by_step} | {by_step} | {by_step} | {numbers} | – | – |" in text
+    assert iio.imread(tmp_path / "belief.png").std() > 10
 
 
 def test_interquartile_mean() -> None:
