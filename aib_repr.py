@@ -72,7 +72,7 @@ class Args:
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
-    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
+    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0, others want more --num-episodes"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -80,7 +80,7 @@ class Args:
 
     num_envs: int = 50
     """scenes simulated at a time on physx_cuda, which draws one arm pose for all of them"""
-    num_episodes: int = 1000
+    num_episodes: int = 2000
     """episodes of the random policy"""
     val_share: float = 0.1
     """share of the episodes held out"""

@@ -71,7 +71,7 @@ class Args:
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
-    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
+    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0, others want more --num-episodes"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False

@@ -84,7 +84,7 @@ class Args:
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
-    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
+    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0, others want more --num-episodes"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -92,7 +92,7 @@ class Args:
 
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
-    num_episodes: int = 1000
+    num_episodes: int = 2000
     """episodes of the random policy, where stage 1 has still to collect them"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper calls them epochs"""
