@@ -173,13 +173,18 @@ def main_table(runs: dict, key: tuple[str, str]) -> str:
 
 def read_beliefs(folder: Path) -> dict[str, dict[str, list[dict]]]:
     """diagnostics.json of every --small belief below folder, a list over seeds by task and by what was trained."""
-    found = defaultdict(lambda: {label: [] for label in BELIEFS.values()})
+    found = defaultdict(lambda: defaultdict(list))
+    names = list(BELIEFS)  # in this order, others last
     for file in sorted(folder.glob("*_small*__*/diagnostics.json")):
         args = json.loads((file.parent / "args.json").read_text())
-        other = f"AIB, {args['exp_name'].removeprefix('aib_belief_small_').replace('_', ' ')}"
-        rows = found[args["env_id"]]
-        rows.setdefault(BELIEFS.get(args["exp_name"], other), []).append(json.loads(file.read_text()))
-    return {task: {label: reports for label, reports in rows.items() if reports} for task, rows in found.items()}
+        if args["exp_name"] in BELIEFS:
+            place = names.index(args["exp_name"])
+            label = f"{BELIEFS[args['exp_name']]}, {args['num_episodes']} episodes"
+        else:
+            place = len(names)
+            label = f"AIB, {args['exp_name'].removeprefix('aib_belief_small_').replace('_', ' ')}"
+        found[args["env_id"]][place, label].append(json.loads(file.read_text()))
+    return {task: {label: rows[place, label] for place, label in sorted(rows)} for task, rows in found.items()}
 
 
 def belief_cell(reports: list[dict], column: str) -> str:
@@ -224,7 +229,8 @@ def belief_figure(beliefs: dict, path: Path) -> None:
             ax.grid(alpha=0.3)
         column[0].axhline(reports[0]["cue_chance"], color="grey", linestyle="--", label="chance")
         column[0].set_title(task)
-        column[0].legend(fontsize=8, loc="lower left")
+        lines, labels = column[0].get_legend_handles_labels()
+        column[1].legend(lines, labels, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.18), frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -246,7 +252,8 @@ def small_report(runs: dict, beliefs: dict, output: Path) -> None:
     lines += ["", "![success_once](small.png)", ""]
     if beliefs:
         belief_figure(beliefs, output / "belief.png")
-        lines += ["# What the beliefs remember", "", "![cue and u from the mean particle](belief.png)"]
+        lines += ["# What the beliefs remember of held-out episodes", "", "In brackets: seeds.", ""]
+        lines += ["![cue and u from the mean particle](belief.png)"]
         lines += ["\n" + belief_table(task, rows) for task, rows in beliefs.items()]
     (output / "small.md").write_text("\n".join(lines) + "\n")
     print(f"{output / 'small.md'}: {', '.join(tasks)}")
