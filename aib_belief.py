@@ -69,7 +69,7 @@ class Args:
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
-    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0, others want more --num-episodes"""
+    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -329,7 +329,7 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     size = QUICK if args.quick else SMALL if args.small else {}
     if not (path / "repr.pt").exists() and args.repr_dir == size.get("repr_dir", Args.repr_dir):
         run_stage("aib_repr.py", args)
-    hint = "make it anew with aib_repr.py --overwrite and the same --env-id, --seed, --num-episodes and size"
+    hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
@@ -529,8 +529,8 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
-        least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
-        least = 0.001 if name == "init_std" else least
+        least = 0 if isinstance(value, bool | float) else 1
+        least = {"seed": 0, "mesh_triangles": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:

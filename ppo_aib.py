@@ -81,7 +81,7 @@ class Args:
     num_workers: int = 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; results depend on their number by rounding alone"""
     small: bool = False
-    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0, others want more --num-episodes"""
+    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -318,7 +318,7 @@ def rollout_with_belief(
 
     Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
     V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs; as all noise is drawn before, they do not change it on physx_cpu.
+    episodes are played in rounds of envs.num_envs; noise is drawn before, so their size is nothing to physx_cpu.
     """
     steps, count, (action_dim,) = envs.spec.max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
@@ -415,9 +415,8 @@ def main(args: Args) -> None:
         stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
         for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
             setattr(args, name, stored[name])
-        check_task(args)
-    else:
-        check_task(args)
+    check_task(args)
+    if not args.evaluate:
         path = open_run(args)
         resume = (path / "checkpoint.pt").exists()
         checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
@@ -427,7 +426,7 @@ def main(args: Args) -> None:
         file, size = Path(args.belief.format(**vars(args))), QUICK if args.quick else SMALL if args.small else {}
         if not file.exists() and args.belief == size.get("belief", Args.belief):
             run_stage("aib_belief.py", args)
-        hint = "make it anew with aib_belief.py --overwrite and the same --env-id, --seed, --num-episodes and size"
+        hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_belief.py --overwrite"
         task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
         stored = load(file, hint, kind="aib_belief", **task)
 
@@ -667,8 +666,8 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
-        least = 0 if isinstance(value, bool | float) or name in ("seed", "mesh_triangles") else 1
-        least = 0.001 if name == "init_std" else least
+        least = 0 if isinstance(value, bool | float) else 1
+        least = {"seed": 0, "mesh_triangles": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:

@@ -51,9 +51,8 @@ def main(args: Args) -> None:
     phi.load_state_dict(stored_repr["phi"])
     belief = aib_belief.AIBBelief(stored["config"])
     belief.load_state_dict(stored["belief"])
-    posterior = aib_belief.GaussianMLP(
-        stored_repr["u_dim"] + 256, [256, 256], stored["z_dim"], min_std=0.1
-    )  # not looked at
+    # encode asks for a posterior too; what it says is not looked at
+    posterior = aib_belief.GaussianMLP(stored_repr["u_dim"] + 256, [256, 256], stored["z_dim"], min_std=0.1)
 
     def encode(path: Path, count: int) -> dict[str, torch.Tensor]:
         """aib_belief.encode of the last episodes of a dataset."""

@@ -227,7 +227,7 @@ def belief_figure(beliefs: dict, path: Path) -> None:
                 ax.plot(np.mean([report[name] for report in reports], 0), label=f"{label} ({len(reports)})")
             ax.set(xlabel="step", ylabel=f"{title}, from the mean particle", ylim=(-0.3, 1.05))
             ax.grid(alpha=0.3)
-        column[0].axhline(reports[0]["cue_chance"], color="grey", linestyle="--", label="chance")
+        column[0].axhline(next(iter(rows.values()))[0]["cue_chance"], color="grey", linestyle="--", label="chance")
         column[0].set_title(task)
         lines, labels = column[0].get_legend_handles_labels()
         column[1].legend(lines, labels, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.18), frameon=False)
