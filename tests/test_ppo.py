@@ -80,6 +80,46 @@ def test_amp_changes_the_belief_by_rounding_only(toy_stages: Path) -> None:
     assert not torch.equal(exact, rounded) and torch.allclose(exact, rounded, atol=0.05)
 
 
+@pytest.mark.parametrize("script", METHODS)
+def test_an_iteration_plays_new_episodes_and_learns_from_each_step_with_its_own_return(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    module, played, seen = SCRIPTS[script], [], []
+    name = "rollout" if script == "ppo_baseline" else "rollout_with_belief"
+    rollout, losses = getattr(module, name), module.ppo_losses
+
+    def watched_rollout(*args: object, explore: bool = True) -> dict:
+        data = rollout(*args, explore=explore)
+        played.append((explore, args[3].tolist(), {name: x.clone() for name, x in data.items()}))
+        return data
+
+    monkeypatch.setattr(module, name, watched_rollout)
+    monkeypatch.setattr(
+        module, "ppo_losses", lambda agent, batch, args: seen.append(batch) or losses(agent, batch, args)
+    )
+    path = train(module, **small(module, toy_stages, target_kl=1e9))
+    (_, seeds, data), (_, other_seeds, other) = (one for one in played if one[0])
+    evaluated, evaluated_again = (one[1] for one in played if not one[0])
+    assert len({*seeds, *other_seeds, *evaluated}) == 8 + 8 + 6 and evaluated == evaluated_again
+    assert max(seeds + other_seeds) < 2**30 <= min(evaluated)
+    key, other_key = data["logprob"], other["logprob"]  # tells the noise, whatever the policy's means
+    assert min(key.std(0).min(), key.std(1).min(), (key - other_key).std()) > 0.1, "fresh noise at every step"
+
+    assert len(seen) == 2 * 2 * 4 and all(len(batch["action"]) == 20 for batch in seen)
+    values = data["value"]
+    data["advantage"] = module.compute_gae(data["reward"], values, 0.99, 0.9)
+    data["return"] = data["advantage"] + values[:-1]
+    order = key.flatten().argsort()
+    for batches in (seen[:4], seen[4:8]):
+        keys = torch.cat([batch["logprob"] for batch in batches])
+        for name in seen[0]:
+            x = torch.cat([batch[name] for batch in batches])
+            assert torch.equal(x[keys.argsort()], data[name].flatten(0, 1)[order]), name
+    assert not torch.equal(seen[0]["logprob"], seen[4]["logprob"]), "each pass in an order of its own"
+    adam = torch.load(path / "checkpoint.pt", weights_only=True)["optimizer"]["param_groups"][0]
+    assert (adam["lr"], adam["eps"]) == (1e-4, 1e-5)
+
+
 def test_the_last_iterations_images_are_gone_when_the_next_begins(
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
