@@ -70,18 +70,22 @@ def test_peak_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path) -
 def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_the_other(
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looks, encode = [], aib_belief.encode
+    looks, encoded, encode = [], [], aib_belief.encode
 
     def recorded(belief: torch.nn.Module, *arguments: object) -> dict[str, torch.Tensor]:
         looks.append((arguments[-1].tolist(), {name: x.clone() for name, x in belief.state_dict().items()}))
-        return encode(belief, *arguments)
+        encoded.append(encode(belief, *arguments))
+        return encoded[-1]
 
     monkeypatch.setattr(aib_belief, "encode", recorded)
     repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
     path = train(aib_belief, repr_dir=repr_dir, num_episodes=20, num_updates=6, batch_episodes=4, held_out_every=2)
     fit, test = [15, 16, 17], [18, 19]  # of 20 episodes, a quarter of which is held out
     assert [episodes for episodes, _ in looks] == [test] * 3 + [fit, test]
-    stored = torch.load(path / "belief.pt", weights_only=True)["belief"]
+    stored = torch.load(path / "belief.pt", weights_only=True)
+    some = encoded[-2]["particle"][:, ::8].flatten(0, 1)
+    assert torch.equal(stored["readout_data"]["particle"], some) and len(stored["readout_data"]["cue"]) == len(some)
+    stored = stored["belief"]
     assert all(torch.equal(stored[name], x) for name, x in looks[2][1].items())  # the last weights
     assert any((stored[name] != x).any() for name, x in looks[1][1].items())
 

@@ -13,8 +13,9 @@ from torch.distributions import Normal
 import aib_belief
 import aib_repr
 import ppo_aib
+import ppo_baseline
 import ppo_believer
-from conftest import TOY
+from conftest import TOY, train
 
 IMAGE = [36, 36, 3]
 CONFIG = {"image_shape": IMAGE, "joints_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
@@ -96,6 +97,26 @@ def test_stage_1_targets_stop_the_gradient() -> None:
     assert losses["state"].requires_grad and losses["obs"].requires_grad
     losses["total"].backward()
     assert batch["next_state"].grad is None and batch["next_joints"].grad is None
+
+
+def test_transitions_lie_within_an_episode_and_each_is_learnt_from_once_an_epoch(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
+    arrays = {file.stem: np.load(file) for file in dataset.glob("*.npy")}
+    batch = aib_repr.read_transitions(dataset, np.array([0, 9, 10, 199]), torch.device("cpu"))
+    for row, (episode, t) in enumerate([(0, 0), (0, 9), (1, 0), (19, 9)]):
+        for name in ("rgb", "joints", "state", "actions", "rewards"):
+            assert np.array_equal(batch[name][row], arrays[name][episode, t]), name
+        for name in ("rgb", "joints", "state"):
+            assert np.array_equal(batch[f"next_{name}"][row], arrays[name][episode, t + 1]), name
+    read, transitions = [], aib_repr.read_transitions
+    monkeypatch.setattr(aib_repr, "read_transitions", lambda *args: read.append(args[1]) or transitions(*args))
+    train(aib_repr, num_episodes=20, val_share=0.25, epochs=2, batch_size=50)
+    epochs, held_out = [np.concatenate(read[:3]), np.concatenate(read[4:7])], [read[3], read[7]]
+    assert all(sorted(epoch) == list(range(150)) for epoch in epochs), "of 15 episodes of 10 steps"
+    assert not np.array_equal(*epochs) and not np.array_equal(epochs[0], np.arange(150))
+    assert all(set(index) <= set(range(150, 200)) for index in held_out)
 
 
 # ---------------------------------------------------------------- stage 2
@@ -278,7 +299,7 @@ def test_chrono_initialisation_sets_the_update_gate() -> None:
     assert kept.mean() > 0.85
 
 
-def test_the_belief_keeps_the_training_episodes_mean_image_and_joints(toy_stages: Path) -> None:
+def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_stages: Path) -> None:
     rgb = np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "rgb.npy")[:15, ::8].astype(float)
     history = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)["belief"]
     assert torch.allclose(history["history.image_mean"].double(), torch.from_numpy(rgb.mean((0, 1))), atol=1e-3)
@@ -286,6 +307,8 @@ def test_the_belief_keeps_the_training_episodes_mean_image_and_joints(toy_stages
     joints = torch.from_numpy(np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "joints.npy")[:15]).flatten(0, 1)
     assert torch.allclose(history["history.joints_mean"], joints.mean(0), atol=1e-4)
     assert torch.allclose(history["history.joints_std"], joints.std(0, correction=0), atol=1e-4)
+    gate = history["history.gru.bias_ih_l0"][256:512]
+    assert gate.min() > -0.1 and 1 < gate.max() < math.log(9) + 0.1, "chrono_init, and three updates"
 
 
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:
@@ -373,6 +396,7 @@ def test_belief_aggregator_is_the_papers_formula() -> None:
     agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG), 7, A, 0.6)
     obs = {"rgb": torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8), "joints": torch.randn(B, 7)}
     particles = torch.randn(B, 30, 4)
+    nn.init.orthogonal_(agent.actor[-1].weight, 3.0)  # else too near 0 to tell tanh from nothing
     policy, value = agent({**obs, "particles": particles})
     assert policy.mean.shape == (B, A) and value.shape == (B,)
     belief = agent.w_agg(torch.stack([agent.w_enc(particles[:, i]) for i in range(30)]).mean(0))
@@ -380,6 +404,16 @@ def test_belief_aggregator_is_the_papers_formula() -> None:
     x = torch.cat([image, joints, belief], -1)
     assert torch.allclose(policy.mean, torch.tanh(agent.actor(x)), atol=1e-6)
     assert torch.allclose(value, agent.critic(x)[:, 0], atol=1e-6)
+    plain = ppo_baseline.Agent(IMAGE, 7, A, 0.6)
+    nn.init.orthogonal_(plain.actor[-1].weight, 3.0)
+    x = torch.cat([plain.cnn(obs["rgb"].float() / 255), plain.joints(obs["joints"])], -1)
+    assert torch.allclose(plain(obs)[0].mean, torch.tanh(plain.actor(x)), atol=1e-6)
+
+
+def test_success_once_and_at_end() -> None:
+    success = torch.tensor([[0.0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 0]])  # in 2 of 4 episodes, once, at the end in 1
+    metrics = ppo_aib.success_and_return({"success": success, "reward": torch.full((3, 4), 0.5)})
+    assert metrics == {"success_once": 0.5, "success_at_end": 0.25, "return": 1.5}
 
 
 def test_ppo_losses_are_the_closed_forms() -> None:

@@ -33,12 +33,12 @@ def small(module: ModuleType, toy_stages: Path, **changes: object) -> dict:
     return {**SMALL, **more, **changes}
 
 
-def play(toy_stages: Path, amp: bool = False) -> tuple[ppo_aib.BeliefAgent, dict[str, torch.Tensor]]:
+def play(toy_stages: Path, **changes: object) -> tuple[ppo_aib.BeliefAgent, dict[str, torch.Tensor]]:
     """An AIB agent and what it played in one iteration of the toy task."""
-    args = ppo_aib.Args(env_id=TOY, **small(ppo_aib, toy_stages, amp=amp))
+    args = ppo_aib.Args(env_id=TOY, **small(ppo_aib, toy_stages, **changes))
     stored = torch.load(args.belief, weights_only=True)
     torch.manual_seed(0)
-    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(stored["config"], amp), 3, 2, 0.6, amp)
+    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(stored["config"], args.amp), 3, 2, 0.6, args.amp)
     agent.belief.load_state_dict(stored["belief"])
     torch.manual_seed(1)
     return agent, ppo_aib.rollout_with_belief(toy.make_envs(args), agent, args, np.arange(8))
@@ -75,9 +75,28 @@ def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path
 
 
 def test_amp_changes_the_belief_by_rounding_only(toy_stages: Path) -> None:
-    exact, rounded = (play(toy_stages, amp)[1]["particles"][0] for amp in (False, True))  # later steps see other images
+    exact, rounded = (
+        play(toy_stages, amp=amp)[1]["particles"][0] for amp in (False, True)
+    )  # later steps see other images
     assert rounded.dtype == torch.float32
     assert not torch.equal(exact, rounded) and torch.allclose(exact, rounded, atol=0.05)
+
+
+def test_particle_noise_is_the_decoders(toy_stages: Path) -> None:
+    drawn, means = (play(toy_stages, particle_noise=noise)[1]["particles"][0] for noise in (True, False))
+    assert drawn.std(1).mean() > 0.5 and means.std(1).mean() < 0.2  # the decoder's std is still about softplus(0) + 0.1
+
+
+def test_the_cue_readout_is_fitted_on_random_actions_episodes(toy_stages: Path) -> None:
+    agent, _ = play(toy_stages)
+    args = ppo_aib.Args(env_id=TOY, **small(ppo_aib, toy_stages))
+    particle, colour = torch.randn(30, 16), torch.arange(30)[:, None] % 3
+    for readout_data, known in (
+        ({"particle": particle, "cue": torch.zeros(30, 1)}, False),  # one colour only: nothing to tell
+        ({"particle": particle, "cue": colour.float()}, True),
+    ):
+        metrics, _ = ppo_aib.evaluate_with_belief(toy.make_envs(args), agent, args, readout_data)
+        assert math.isnan(metrics["cue_readout"]) != known
 
 
 @pytest.mark.parametrize("script", METHODS)

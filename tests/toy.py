@@ -54,6 +54,7 @@ class ToyMemory(gym.vector.VectorEnv):
 
     def step(self, actions: np.ndarray) -> tuple:
         """Act in every episode."""
+        assert np.abs(actions).max() <= 1, "actions are clamped to the box"
         self.action = np.asarray(actions)[:, 0]
         self.t += 1
         obs, info = self._observe()
