@@ -411,9 +411,9 @@ def test_belief_aggregator_is_the_papers_formula() -> None:
 
 
 def test_success_once_and_at_end() -> None:
-    success = torch.tensor([[0.0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 0]])  # in 2 of 4 episodes, once, at the end in 1
+    success = torch.tensor([[0.0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 0]])  # in 3 of 4 episodes once, at the end in 1
     metrics = ppo_aib.success_and_return({"success": success, "reward": torch.full((3, 4), 0.5)})
-    assert metrics == {"success_once": 0.5, "success_at_end": 0.25, "return": 1.5}
+    assert metrics == {"success_once": 0.75, "success_at_end": 0.25, "return": 1.5}
 
 
 def test_ppo_losses_are_the_closed_forms() -> None:
