@@ -32,12 +32,13 @@ TASKS = {
 METHODS = {"ppo_aib": "AIB", "ppo_believer": "Believer", "ppo_baseline": "PPO"}
 COLOURS = {"ppo_aib": "tab:red", "ppo_believer": "tab:blue", "ppo_baseline": "tab:green"}
 HEADS = {"ppo_aib": "flow matching", "ppo_aib_none": "no action head", "ppo_aib_mse": "MSE regression"}
-BELIEFS = {
-    "aib_belief_small": "AIB, flow matching",
-    "aib_belief_small_mse": "AIB, MSE regression",
-    "aib_belief_small_none": "AIB, no action head",
-    "ppo_believer_small": "Believer",
+BELIEFS = {  # action_head in args.json, which Believer has not
+    "flow": "AIB, flow matching",
+    "mse": "AIB, MSE regression",
+    "none": "AIB, no action head",
+    None: "Believer",
 }
+BELIEF_DEFAULTS = {"fm_latent": "mean", "history_joints": True, "action_lambda": 1.0, "image_norm": "mean"}
 BELIEF_COLUMNS = {  # of diagnostics.json
     "cue from h": "cue_from_h",
     "cue from the mean particle": "cue_from_particle",
@@ -172,19 +173,22 @@ def main_table(runs: dict, key: tuple[str, str]) -> str:
 
 
 def read_beliefs(folder: Path) -> dict[str, dict[str, list[dict]]]:
-    """diagnostics.json of every --small belief below folder, a list over seeds by task and by what was trained."""
+    """diagnostics.json of every --small belief below folder, a list over seeds by task and by what was trained.
+
+    What was trained is read from args.json; its "note" tells of an experiment that the scripts have no argument for.
+    """
     found = defaultdict(lambda: defaultdict(list))
-    names = list(BELIEFS)  # in this order, others last
     for file in sorted(folder.glob("*_small*__*/diagnostics.json")):
         args = json.loads((file.parent / "args.json").read_text())
-        if args["exp_name"] in BELIEFS:
-            place = names.index(args["exp_name"])
-            label = f"{BELIEFS[args['exp_name']]}, {args['num_episodes']} episodes"
-        else:
-            place = len(names)
-            label = f"AIB, {args['exp_name'].removeprefix('aib_belief_small_').replace('_', ' ')}"
-        found[args["env_id"]][place, label].append(json.loads(file.read_text()))
-    return {task: {label: rows[place, label] for place, label in sorted(rows)} for task, rows in found.items()}
+        head, size = args.get("action_head"), (args["num_episodes"], args["num_updates"])
+        label = f"{BELIEFS[head]}, {size[0]:,} episodes, {size[1]:,} updates"
+        for name, default in BELIEF_DEFAULTS.items():
+            if args.get(name, default) != default:
+                label += f", {name} {args[name]}"
+        if "note" in args:
+            label += f", {args['note']}"
+        found[args["env_id"]][size, list(BELIEFS).index(head), label].append(json.loads(file.read_text()))
+    return {task: {key[-1]: rows[key] for key in sorted(rows)} for task, rows in found.items()}
 
 
 def belief_cell(reports: list[dict], column: str) -> str:

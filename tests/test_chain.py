@@ -40,8 +40,10 @@ def test_dataset(quick_runs: Path) -> None:
     }
     assert {name: (array.shape, array.dtype) for name, array in arrays.items()} == expected
     assert np.abs(arrays["actions"]).max() <= 1 and abs(arrays["actions"].std() - 3**-0.5) < 0.02, "uniform"
-    assert len(np.unique(arrays["cue"], axis=0)) > 1
+    assert len(np.unique(arrays["actions"].reshape(8, -1), axis=0)) == 8 and len(np.unique(arrays["cue"], axis=0)) > 1
     assert (arrays["rgb"][:, 0] != arrays["rgb"][:, 30]).any((1, 2, 3)).all()
+    phi = torch.load(data.parent / "repr.pt", weights_only=True)["phi"]
+    assert phi["std"].min() == np.float32(0.05), "what hardly varies in the state counts for little"
 
 
 @pytest.mark.parametrize("script", ["ppo_aib", "ppo_believer", "ppo_baseline"])

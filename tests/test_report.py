@@ -53,7 +53,7 @@ def test_small_runs_of_any_task(tmp_path: Path) -> None:
         run = tmp_path / f"X-v0__aib_belief_small__{seed}"
         run.mkdir()
         (run / "args.json").write_text(
-            json.dumps({"env_id": "X-v0", "exp_name": "aib_belief_small", "num_episodes": 9})
+            json.dumps({"env_id": "X-v0", "action_head": "mse", "num_episodes": 9, "num_updates": 1000, "note": "wet"})
         )
         lists = {name: [0.0] * 40 + [cue] for name in ("cue_from_h", "cue_from_particle", "u_r2_prior")}
         numbers = dict.fromkeys(("cue_chance", "nll_prior", "nll_posterior", "action_readout"), 2 * cue)
@@ -66,8 +66,8 @@ def test_small_runs_of_any_task(tmp_path: Path) -> None:
         and iio.imread(tmp_path / "small.png").std() > 10
     )
     by_step = "0.00 ± 0.00 / 0.00 ± 0.00 / 0.00 ± 0.00 / 0.60 ± 0.14"
-    numbers = " | ".join(["1.20 ± 0.28"] * 3)
-    assert f"| AIB, flow matching, 9 episodes | 2 | {by_step} | {by_step} | {by_step} | {numbers} | – | – |" in text
+    row = ["AIB, MSE regression, 9 episodes, 1,000 updates, wet", "2", *[by_step] * 3, *["1.20 ± 0.28"] * 3, "–", "–"]
+    assert "| " + " | ".join(row) + " |" in text
     assert iio.imread(tmp_path / "belief.png").std() > 10
 
 
