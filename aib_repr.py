@@ -98,7 +98,7 @@ class Args:
     """lambda_s"""
     obs_coef: float = 0.03
     """lambda_o"""
-    kl_coef: float = 0.01
+    kl_coef: float = 0.003
     """lambda_KL; the paper's 0.03, summed over u's dimensions, leaves too little of the cue in u"""
     reward_norm: bool = True
     """standardise rewards; without it the reward term of a random policy is next to nothing"""
@@ -109,6 +109,7 @@ class Args:
 
 
 SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, epochs=7, batch_size=100, learning_rate=1e-3)
+SMALL |= dict(kl_coef=0.01)  # so short a training forgets nothing yet
 QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_share=0.5, epochs=2)
 
 
