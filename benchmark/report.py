@@ -175,7 +175,7 @@ def main_table(runs: dict, key: tuple[str, str]) -> str:
 def read_beliefs(folder: Path) -> dict[str, dict[str, list[dict]]]:
     """diagnostics.json of every --small belief below folder, a list over seeds by task and by what was trained.
 
-    What was trained is read from args.json; its "note" tells of an experiment that the scripts have no argument for.
+    What was trained is read from args.json; a "note" in it tells what stage 2's arguments cannot.
     """
     found = defaultdict(lambda: defaultdict(list))
     for file in sorted(folder.glob("*_small*__*/diagnostics.json")):
