@@ -104,7 +104,8 @@ def speed(device: torch.device) -> str:
 def main(args: Args) -> None:
     """Run what is missing and print the table."""
     for seed in args.seeds:
-        base, stage_1, stage_2 = ["--env-id", args.env_id, "--seed", str(seed), "--small"], [], []
+        base = ["--env-id", args.env_id, "--seed", str(seed), "--small"]
+        stage_1, stage_2 = [], []
         if args.more_data:
             base += ["--num-episodes", "2000"]
             stage_1 = ["--exp-name", "aib_repr_small_2000", "--epochs", "3"]

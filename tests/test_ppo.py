@@ -75,9 +75,8 @@ def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path
 
 
 def test_amp_changes_the_belief_by_rounding_only(toy_stages: Path) -> None:
-    exact, rounded = (
-        play(toy_stages, amp=amp)[1]["particles"][0] for amp in (False, True)
-    )  # later steps see other images
+    # later steps than the first see other images
+    exact, rounded = (play(toy_stages, amp=amp)[1]["particles"][0] for amp in (False, True))
     assert rounded.dtype == torch.float32
     assert not torch.equal(exact, rounded) and torch.allclose(exact, rounded, atol=0.05)
 
