@@ -73,12 +73,12 @@ class Args:
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
-    """delete what the run directory holds and start anew"""
+    """delete what the run directory holds and start anew, every time it is given"""
 
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """episodes of the random policy, where stage 1 has still to collect them"""
+    """episodes of the random policy behind the belief; stage 1 collects them where they are missing"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper calls them epochs"""
     batch_episodes: int = 256
@@ -180,7 +180,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has the actions too; given them, z could carry a_t with no regard for the world.
+    The paper's history (E.2) has the actions too; here the joints, which follow them, must do.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -490,7 +490,7 @@ def main(args: Args) -> None:
             save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
     bar.close()
 
-    # the last weights: held-out error and likelihood are best before the belief remembers
+    # the last weights: held-out error and likelihood turn while memory still grows
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = diagnose_belief(fit, test)
     if args.action_head == "flow":
@@ -606,4 +606,4 @@ if __name__ == "__main__":
     try:
         main(parse_args({}, SMALL, QUICK))
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command goes on from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")

@@ -75,7 +75,7 @@ class Args:
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
-    """delete what the run directory holds and start anew"""
+    """delete what the run directory holds and start anew, every time it is given"""
 
     num_envs: int = 50
     """scenes simulated at a time on physx_cuda, which draws one arm pose for all of them"""
@@ -426,12 +426,11 @@ def lighten_meshes(task: gym.Env, triangles: int) -> None:
             for part in shape.parts:
                 mesh = trimesh.Trimesh(part.vertices, part.triangles, process=False)
                 if len(mesh.faces) > triangles:
-                    mesh.merge_vertices(digits_vertex=2)  # of a centimetre, about a pixel: every triangle has its own
+                    mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files no two triangles share any
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
-                light = sapien.render.RenderShapeTriangleMesh(
-                    mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2)), part.material
-                )
+                arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))
+                light = sapien.render.RenderShapeTriangleMesh(*arrays, part.material)
                 light.local_pose = shape.local_pose
                 new.attach(light)
         if old:
@@ -443,6 +442,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
     backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
+    modes["reconfiguration_freq"] = 0  # ShellGame tasks would build the scene, with stock meshes, at every reset
     with light_shaders() if args.render_backend == "sapien_cpu" else nullcontext():
         env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
@@ -459,7 +459,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     from one that has done the imports, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
-        return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
+        envs = ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
+        envs.spec = gym.spec(args.env_id)  # ManiSkill's own does not know the number of steps
+        return envs
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
@@ -567,4 +569,4 @@ if __name__ == "__main__":
     try:
         main(parse_args({}, SMALL, QUICK))
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command goes on from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")

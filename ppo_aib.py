@@ -84,12 +84,12 @@ class Args:
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
-    """delete what the run directory holds and start anew"""
+    """delete what the run directory holds and start anew, every time it is given"""
 
     belief: str = "runs/{env_id}__aib_belief__{seed}/belief.pt"
     """belief of stage 2"""
     num_episodes: int = 2000
-    """episodes of the random policy, where stage 1 has still to collect them"""
+    """episodes of the random policy behind the belief; stage 1 collects them where they are missing"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
     particle_noise: bool = True
@@ -193,7 +193,7 @@ class NatureCNN(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has the actions too; given them, z could carry a_t with no regard for the world.
+    The paper's history (E.2) has the actions too; here the joints, which follow them, must do.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -329,7 +329,7 @@ def rollout_with_belief(
     for first in range(0, count, envs.num_envs):
         now = slice(first, min(first + envs.num_envs, count))  # the episodes of this round
         playing = now.stop - now.start  # in the last round some environments may only repeat what others do
-        obs, start = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
+        obs, initial = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
         memory = None
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name][:playing], device=device) for name in ("rgb", "joints")}
@@ -341,7 +341,7 @@ def rollout_with_belief(
             step["logprob"] = policy.log_prob(step["action"]).sum(-1)
             action = step["action"].clamp(-1, 1).cpu().numpy()
             obs, reward, _, _, info = envs.step(np.resize(action, (envs.num_envs, action_dim)))
-            for name, x in (("reward", reward), ("success", info["success"]), ("cue", start["cue"])):
+            for name, x in (("reward", reward), ("success", info["success"]), ("cue", initial["cue"])):
                 step[name] = torch.as_tensor(x[:playing], dtype=torch.float32, device=device)
             for name, x in step.items():
                 if name not in data:
@@ -479,7 +479,7 @@ def main(args: Args) -> None:
                 break
         scalars |= {f"losses/{name}": value.item() for name, value in losses.items()}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
-        scalars |= {"charts/SPS": per_iteration / (time.time() - start), "charts/learning_rate": args.learning_rate}
+        scalars["charts/SPS"] = per_iteration / (time.time() - start)
         del data, batch, losses  # a gigabyte of images and a graph: not two at a time
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
@@ -578,12 +578,11 @@ def lighten_meshes(task: gym.Env, triangles: int) -> None:
             for part in shape.parts:
                 mesh = trimesh.Trimesh(part.vertices, part.triangles, process=False)
                 if len(mesh.faces) > triangles:
-                    mesh.merge_vertices(digits_vertex=2)  # of a centimetre, about a pixel: every triangle has its own
+                    mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files no two triangles share any
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
-                light = sapien.render.RenderShapeTriangleMesh(
-                    mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2)), part.material
-                )
+                arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))
+                light = sapien.render.RenderShapeTriangleMesh(*arrays, part.material)
                 light.local_pose = shape.local_pose
                 new.attach(light)
         if old:
@@ -595,6 +594,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
     backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
+    modes["reconfiguration_freq"] = 0  # ShellGame tasks would build the scene, with stock meshes, at every reset
     with light_shaders() if args.render_backend == "sapien_cpu" else nullcontext():
         env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
@@ -611,7 +611,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     from one that has done the imports, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
-        return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
+        envs = ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
+        envs.spec = gym.spec(args.env_id)  # ManiSkill's own does not know the number of steps
+        return envs
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
@@ -736,4 +738,4 @@ if __name__ == "__main__":
     try:
         main(parse_args(TASKS, SMALL, QUICK))
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command goes on from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")

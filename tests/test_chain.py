@@ -55,7 +55,7 @@ def test_results(quick_runs: Path, script: str) -> None:
     agent = torch.load(path / "agent.pt", weights_only=True)
     assert (agent["kind"], agent["env_id"], agent["global_step"]) == (f"{script} agent", TASK, 360)
     events = EventAccumulator(str(path)).Reload()
-    tags = {"charts/SPS", "charts/learning_rate", "losses/policy_loss", "losses/value_loss", "losses/approx_kl"}
+    tags = {"charts/SPS", "losses/policy_loss", "losses/value_loss", "losses/approx_kl"}
     tags |= {"train/success_once", "eval/success_once", "eval/success_at_end", "eval/return"}
     tags |= {"time/rollout", "time/update"} | ({"eval/cue_readout"} if script != "ppo_baseline" else set())
     assert tags <= set(events.Tags()["scalars"])

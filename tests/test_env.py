@@ -1,6 +1,7 @@
 """The real simulator on the CPU: what a task shows, what only the simulator knows, and that episodes repeat."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import sapien
 
 import aib_repr
+import ppo_baseline
 from conftest import TASK
 
 # RememberColor9's nine colours have six hues on the screen: maroon is a dark red, olive reads as yellow, teal as cyan
@@ -52,6 +54,30 @@ def test_cue_then_nothing_then_nine_cubes_that_rest_on_the_table(env: gym.Env) -
         assert info["cue"] == [cue]
     heights = [float(cube.pose.p[0, 2]) for cube in env.unwrapped.cubes.values()]
     assert np.allclose(heights, 0.02, atol=0.005), "as on the GPU simulator, instead of falling from z = 1000"
+
+
+def test_the_batch_of_physx_cuda_is_played_and_recorded(
+    env: gym.Env, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """ManiSkill's batched environment, here one scene of its CPU simulator, gives what the usual process does."""
+    scene = env.env  # without the wrapper that takes the batch away
+    for script in (aib_repr, ppo_baseline):
+        monkeypatch.setattr(script, "make_task", lambda args, num_scenes: scene)
+    args = aib_repr.Args(env_id=TASK, sim_backend="physx_cuda", num_episodes=2, num_envs=1)
+    arrays = aib_repr.collect(args, tmp_path / "dataset")
+    obs, info = env.reset(seed=1_000_001 + 2**30)
+    assert np.array_equal(arrays["rgb"][1, 0], obs["rgb"]) and np.array_equal(arrays["state"][1, 0], info["state"])
+    for t in range(60):
+        obs, reward, _, _, info = env.step(arrays["actions"][1, t])
+    assert np.allclose(arrays["joints"][1, 60], obs["joints"], atol=1e-3)
+    assert arrays["rewards"][1, 59] == pytest.approx(reward, abs=1e-3) and arrays["cue"][1] == info["cue"]
+
+    envs = ppo_baseline.make_envs(ppo_baseline.Args(env_id=TASK, sim_backend="physx_cuda", num_envs=1))
+    agent = ppo_baseline.Agent([128, 128, 3], 25, 8, 0.6)
+    data = ppo_baseline.rollout(envs, agent, ppo_baseline.Args(device="cpu"), np.array([5, 6]))
+    assert data["rgb"].shape == (60, 2, 128, 128, 3) and data["value"].shape == (61, 2)
+    for i, seed in enumerate((5, 6)):
+        assert np.array_equal(data["rgb"][0, i], env.reset(seed=seed)[0]["rgb"])
 
 
 def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:
