@@ -605,10 +605,10 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
 
 
 def make_envs(args: Args) -> gym.vector.VectorEnv:
-    """Build the environments that play whole episodes in rounds, without auto-reset, arrays with a batch in front.
+    """Build environments whose episodes all last spec.max_episode_steps: actions in [-1, 1], no auto-reset.
 
-    physx_cuda: one batch of args.num_envs scenes. physx_cpu: args.num_workers processes of one scene each, all forked
-    from one that has done the imports, except where there is CUDA, which forbids it.
+    physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
+    forked from one that has done the imports, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
         envs = ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
