@@ -66,8 +66,8 @@ class Args:
     """with or without a camera at its wrist, through which the policy does not see"""
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
-    num_workers: int = 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; results depend on their number by rounding alone"""
+    num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
+    """simulator processes on physx_cpu (results: equal but for rounding); where a GPU renders, each takes some of it"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False

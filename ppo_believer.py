@@ -29,6 +29,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -80,8 +81,8 @@ class Args:
     """with or without a camera at its wrist, through which the policy does not see"""
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
-    num_workers: int = 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; results depend on their number by rounding alone"""
+    num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
+    """simulator processes on physx_cpu (results: equal but for rounding); where a GPU renders, each takes some of it"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -756,6 +757,7 @@ def main(args: Args) -> None:
         save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
         bar.update(per_iteration)
     bar.close()
+    envs.close()
     for name in ("success_once", "success_at_end", "return"):
         values = [row[name] for row in rows]
         print(f"{name}: mean of the last three evaluations {np.mean(values[-3:]):.3f}, maximum {max(values):.3f}")
@@ -869,6 +871,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
         return envs
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
+    resource_tracker.ensure_running()  # its start would lift the block
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])

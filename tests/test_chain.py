@@ -148,7 +148,8 @@ def test_real_workers_end_with_their_parent_killed_or_stopped(quick_runs: Path, 
         wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 20)  # noqa: B023
         if number == signal.SIGINT:
             said = [line for line in err.splitlines() if line.strip() and "it/s" not in line and "step/s" not in line]
-            assert process.returncode == 1 and said == ["stopped; the same command goes on from the last checkpoint"]
+            stopped = "stopped; the same command, without --overwrite, goes on from the last checkpoint"
+            assert process.returncode == 1 and said == [stopped]
     code, out, err = run("aib_repr", "--env-id", TASK, "--quick", cwd=tmp_path)
     assert code == 0, err
     for file in meta.parent.glob("*.npy"):
