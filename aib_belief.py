@@ -471,7 +471,7 @@ def main(args: Args) -> None:
         losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()
-        nn.utils.clip_grad_norm_(model.parameters(), math.inf, error_if_nonfinite=True)  # only stops at NaN
+        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # some batch has a loss of 700
         optimizer.step()
         bar.update()
         if update % 10 == 0:

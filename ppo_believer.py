@@ -628,7 +628,7 @@ def train_belief(args: Args, path: Path) -> None:
         losses = believer_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()
-        nn.utils.clip_grad_norm_(model.parameters(), math.inf, error_if_nonfinite=True)  # only stops at NaN
+        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # some batch has a loss of 700
         optimizer.step()
         bar.update()
         if update % 10 == 0:
