@@ -344,10 +344,11 @@ def main(args: Args) -> None:
             some = read_transitions(dataset, held_out[:: len(held_out) // 1000 + 1], device)
             val_losses = repr_losses(model, some, args)
             active = (phi(some["state"]).mean.std(0) > 0.1).sum()
-        writer.add_scalar("held_out/active_dimensions", active, bar.n)  # of u: the others are silent
+        update = (epoch + 1) * per_epoch
+        writer.add_scalar("held_out/active_dimensions", active, update)  # of u: the others are silent
         for name, loss in losses.items():
-            writer.add_scalar(f"losses/{name}", loss, bar.n)
-            writer.add_scalar(f"held_out/{name}", val_losses[name], bar.n)
+            writer.add_scalar(f"losses/{name}", loss, update)
+            writer.add_scalar(f"held_out/{name}", val_losses[name], update)
         writer.flush()
         checkpoint = {"epoch": epoch + 1, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
         save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})

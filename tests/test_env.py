@@ -60,9 +60,9 @@ def test_the_batch_of_physx_cuda_is_played_and_recorded(
     env: gym.Env, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """ManiSkill's batched environment, here one scene of its CPU simulator, gives what the usual process does."""
-    scene = env.env  # without the wrapper that takes the batch away
+    make_task = aib_repr.make_task  # .env: without the wrapper that takes the batch away
     for script in (aib_repr, ppo_baseline):
-        monkeypatch.setattr(script, "make_task", lambda args, num_scenes: scene)
+        monkeypatch.setattr(script, "make_task", lambda args, num_scenes: make_task(aib_repr.Args(env_id=TASK), 1).env)
     args = aib_repr.Args(env_id=TASK, sim_backend="physx_cuda", num_episodes=2, num_envs=1)
     arrays = aib_repr.collect(args, tmp_path / "dataset")
     obs, info = env.reset(seed=1_000_001 + 2**30)
