@@ -69,7 +69,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu (results: equal but for rounding); where a GPU renders, each takes some of it"""
+    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU that renders"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
