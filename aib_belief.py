@@ -9,7 +9,6 @@ Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where they are 
 Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, TensorBoard events
 """
 
-import argparse
 import ctypes
 import fcntl
 import json
@@ -21,7 +20,6 @@ import signal
 import subprocess
 import sys
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
@@ -307,11 +305,9 @@ class Episodes:
         arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
         self.arrays = {name: x.to(device) for name, x in (*arrays.items(), ("u", u))}
         self.file, self.device, self.rgb = dataset / "rgb.npy", device, None
-        rgb = np.load(self.file, mmap_mode="r")
+        rgb = np.load(self.file, mmap_mode="c")  # copy-on-write, without which torch warns
         if device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
-            self.rgb = torch.empty(rgb.shape, dtype=torch.uint8, device=device)
-            for i in range(len(rgb)):
-                self.rgb[i] = torch.from_numpy(rgb[i])
+            self.rgb = torch.from_numpy(rgb).to(device)
 
     def __call__(self, index: np.ndarray) -> dict[str, torch.Tensor]:
         """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
@@ -462,9 +458,9 @@ def main(args: Args) -> None:
         first = checkpoint["update"]
         print(f"going on with {path} at update {first}", flush=True)
     writer = SummaryWriter(path, purge_step=first + 1)
-    bar = tqdm(total=args.num_updates, initial=first, desc="belief", unit="update")
+    bar = tqdm(range(first + 1, args.num_updates + 1), "belief", args.num_updates, initial=first, unit="update")
 
-    for update in range(first + 1, args.num_updates + 1):
+    for update in bar:
         rng = np.random.default_rng([args.seed, update])
         batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
@@ -473,7 +469,6 @@ def main(args: Args) -> None:
         losses["total"].backward()
         nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # one odd batch can cost the memory
         optimizer.step()
-        bar.update()
         if update % 10 == 0:
             for name, value in losses.items():
                 writer.add_scalar(f"belief/{name}", value, update)
@@ -488,24 +483,23 @@ def main(args: Args) -> None:
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
-    bar.close()
 
-    # the last weights: held-out error and likelihood turn while memory still grows
+    # the last weights: held-out error and likelihood are best before the belief remembers
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = diagnose_belief(fit, test)
     if args.action_head == "flow":
         report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["action"])
         sampled = flow_gain(model["head"], test["z"], test["action"])
         report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
+    for name, values in report.items():  # curves over an episode's steps
+        for step, value in enumerate(values if isinstance(values, list) else []):
+            writer.add_scalar(f"by_time_step/{name}", value, step)
+    writer.close()
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     some = fit["particle"][:, ::8]  # every 8th step is enough
     readout_data = {"particle": some.flatten(0, 1), "cue": fit["cue"].repeat_interleave(some.shape[1], 0)}
     content = {"kind": "aib_belief", **asdict(args), "config": config, "readout_data": readout_data}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
-    for name, values in report.items():  # curves over an episode's steps
-        for step, value in enumerate(values if isinstance(values, list) else []):
-            writer.add_scalar(f"by_time_step/{name}", value, step)
-    writer.close()
     known = [f"{name} {report[name][-1]:.2f}" for name in ("cue_from_u", "cue_from_particle", "u_r2_prior")]
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: {', '.join(known)}")
 
@@ -521,11 +515,7 @@ def fail(message: str) -> NoReturn:
 
 def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--env-id", "--env_id", default=Args.env_id)
-    early.add_argument("--small", action="store_true")
-    early.add_argument("--quick", action="store_true")
-    chosen, _ = early.parse_known_args()
+    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
     settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
@@ -593,10 +583,9 @@ def run_stage(script: str, args: Args) -> None:
     for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
-    # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it
-    end_with_parent = partial(ctypes.CDLL(None).prctl, 1, signal.SIGTERM)
-    child = subprocess.Popen(command, start_new_session=True, preexec_fn=end_with_parent)
-    handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))
+    libc = ctypes.CDLL(None)  # its prctl(PR_SET_PDEATHSIG = 1): the stage ends when this process is killed
+    child = subprocess.Popen(command, start_new_session=True, preexec_fn=lambda: libc.prctl(1, signal.SIGTERM))
+    handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))  # Ctrl-C is handed on to it
     if child.wait():
         sys.exit(child.returncode)
     signal.signal(signal.SIGINT, handler)

@@ -7,11 +7,10 @@ Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events
 """
 
-import argparse
 import fcntl
 import json
 import math
-import multiprocessing
+import multiprocessing.resource_tracker
 import os
 import shutil
 import signal
@@ -22,7 +21,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -79,7 +77,7 @@ class Args:
     """delete what the run directory holds and start anew, every time it is given"""
 
     num_envs: int = 50
-    """scenes simulated at a time on physx_cuda, which draws one arm pose for all of them"""
+    """at most so many scenes at a time; physx_cuda draws one arm pose for all of them"""
     num_episodes: int = 2000
     """episodes of the random policy; 640 are enough for RememberColor3-v0, not for harder tasks"""
     val_share: float = 0.1
@@ -467,7 +465,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
         return envs
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
-    resource_tracker.ensure_running()  # its start would lift the block
+    multiprocessing.resource_tracker.ensure_running()  # its start would lift the block
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])
@@ -505,11 +503,7 @@ def fail(message: str) -> NoReturn:
 
 def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--env-id", "--env_id", default=Args.env_id)
-    early.add_argument("--small", action="store_true")
-    early.add_argument("--quick", action="store_true")
-    chosen, _ = early.parse_known_args()
+    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
     settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():

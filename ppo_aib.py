@@ -9,12 +9,11 @@ Reads:   runs/{env_id}__aib_belief__{seed}/belief.pt; where it is missing, aib_b
 Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events
 """
 
-import argparse
 import ctypes
 import fcntl
 import json
 import math
-import multiprocessing
+import multiprocessing.resource_tracker
 import os
 import shlex
 import shutil
@@ -26,9 +25,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import pairwise
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -618,7 +615,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
         return envs
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
-    resource_tracker.ensure_running()  # its start would lift the block
+    multiprocessing.resource_tracker.ensure_running()  # its start would lift the block
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])
@@ -656,11 +653,7 @@ def fail(message: str) -> NoReturn:
 
 def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--env-id", "--env_id", default=Args.env_id)
-    early.add_argument("--small", action="store_true")
-    early.add_argument("--quick", action="store_true")
-    chosen, _ = early.parse_known_args()
+    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
     settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
@@ -728,10 +721,9 @@ def run_stage(script: str, args: Args) -> None:
     for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
-    # PR_SET_PDEATHSIG = 1: the stage ends when this process is killed; Ctrl-C is handed on to it
-    end_with_parent = partial(ctypes.CDLL(None).prctl, 1, signal.SIGTERM)
-    child = subprocess.Popen(command, start_new_session=True, preexec_fn=end_with_parent)
-    handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))
+    libc = ctypes.CDLL(None)  # its prctl(PR_SET_PDEATHSIG = 1): the stage ends when this process is killed
+    child = subprocess.Popen(command, start_new_session=True, preexec_fn=lambda: libc.prctl(1, signal.SIGTERM))
+    handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))  # Ctrl-C is handed on to it
     if child.wait():
         sys.exit(child.returncode)
     signal.signal(signal.SIGINT, handler)

@@ -5,11 +5,10 @@ Usage:   python ppo_baseline.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events
 """
 
-import argparse
 import fcntl
 import json
 import math
-import multiprocessing
+import multiprocessing.resource_tracker
 import os
 import shutil
 import signal
@@ -19,7 +18,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -477,7 +475,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
         return envs
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
-    resource_tracker.ensure_running()  # its start would lift the block
+    multiprocessing.resource_tracker.ensure_running()  # its start would lift the block
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload([Path(__file__).stem])
@@ -515,11 +513,7 @@ def fail(message: str) -> NoReturn:
 
 def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--env-id", "--env_id", default=Args.env_id)
-    early.add_argument("--small", action="store_true")
-    early.add_argument("--quick", action="store_true")
-    chosen, _ = early.parse_known_args()
+    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
     settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
