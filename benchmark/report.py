@@ -12,6 +12,7 @@ Writes:  {output}/report.md (small.md) and PNG figures
 import csv
 import json
 import sys
+import textwrap
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -221,20 +222,20 @@ def belief_table(task: str, rows: dict[str, list[dict]]) -> str:
 
 
 def belief_figure(beliefs: dict, path: Path) -> None:
-    """Cue and R² of u from the mean particle against the time step, a column per task, means over seeds."""
-    figure, axes = plt.subplots(
-        2, len(beliefs), figsize=(5 * len(beliefs) + 1, 6.5), layout="constrained", squeeze=False
-    )
-    for column, (task, rows) in zip(axes.T, beliefs.items(), strict=True):
-        for ax, name, title in zip(column, ("cue_from_particle", "u_r2_prior"), ("cue", "R² of u"), strict=True):
+    """Cue and R² of u from the mean particle against the time step, three tasks in a row, means over seeds."""
+    height = -(-len(beliefs) // 3)
+    figure = plt.figure(figsize=(15, 6.5 * height), layout="constrained")
+    for part, (task, rows) in zip(figure.subfigures(height, 3, squeeze=False).flat, beliefs.items(), strict=False):
+        axes = part.subplots(2, 1)
+        for ax, name, title in zip(axes, ("cue_from_particle", "u_r2_prior"), ("cue", "R² of u"), strict=True):
             for label, reports in rows.items():
-                ax.plot(np.mean([report[name] for report in reports], 0), label=f"{label} ({len(reports)})")
-            ax.set(xlabel="step", ylabel=f"{title}, from the mean particle", ylim=(-0.3, 1.05))
+                label = textwrap.fill(f"{label} ({len(reports)})", 60)
+                ax.plot(np.mean([report[name] for report in reports], 0), label=label)
+            ax.set(xlabel="step", ylabel=title, ylim=(-0.3, 1.05))
             ax.grid(alpha=0.3)
-        column[0].axhline(next(iter(rows.values()))[0]["cue_chance"], color="grey", linestyle="--", label="chance")
-        column[0].set_title(task)
-        lines, labels = column[0].get_legend_handles_labels()
-        column[1].legend(lines, labels, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.18), frameon=False)
+        axes[0].axhline(next(iter(rows.values()))[0]["cue_chance"], color="grey", linestyle="--", label="chance")
+        axes[0].set_title(task)
+        part.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
