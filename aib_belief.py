@@ -37,9 +37,7 @@ from tqdm import tqdm
 FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
-BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
-if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
-    BFLOAT16 = torch.cuda.is_bf16_supported(False)
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -65,7 +63,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU that renders"""
+    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False

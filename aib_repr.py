@@ -40,9 +40,7 @@ from tqdm import tqdm
 
 FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
-BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
-if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
-    BFLOAT16 = torch.cuda.is_bf16_supported(False)
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -68,7 +66,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU that renders"""
+    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -239,7 +237,7 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
     if meta["episodes_done"] == args.num_episodes:
         return arrays
     envs, count = make_envs(args), args.num_episodes
-    steps, (action_dim,) = envs.spec.max_episode_steps, envs.single_action_space.shape
+    steps, (action_dim,) = gym.spec(args.env_id).max_episode_steps, envs.single_action_space.shape
     bar = tqdm(total=count * steps, initial=meta["episodes_done"] * steps, desc="random policy", unit="step")
     for first in range(meta["episodes_done"], count, envs.num_envs):
         now = np.arange(first, min(first + envs.num_envs, count))  # the episodes of this round
@@ -454,15 +452,13 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
 
 
 def make_envs(args: Args) -> gym.vector.VectorEnv:
-    """Build environments whose episodes all last spec.max_episode_steps: actions in [-1, 1], no auto-reset.
+    """Build environments whose episodes all last max_episode_steps: actions in [-1, 1], no auto-reset.
 
     physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
     forked from one that has done the imports, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
-        envs = ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
-        envs.spec = gym.spec(args.env_id)  # ManiSkill's own does not know the number of steps
-        return envs
+        return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
     multiprocessing.resource_tracker.ensure_running()  # its start would lift the block
@@ -472,7 +468,6 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     gym.logger.min_level = gym.logger.ERROR  # that a run is stopped in the middle of a step deserves no warning
-    envs.spec = gym.spec(args.env_id)
     return envs
 
 
@@ -490,6 +485,11 @@ def check_task(args: Args) -> None:
         sapien.render.RenderSystem(sapien.Device(args.render_backend.removeprefix("sapien_")))
     except RuntimeError as error:
         fail(f"nothing renders with {args.render_backend} ({error}); see README, Troubleshooting: Vulkan driver")
+    try:
+        if args.sim_backend == "physx_cuda":
+            sapien.physx.enable_gpu()  # which downloads a library
+    except (OSError, RuntimeError) as error:
+        fail(f"PhysX does not start on the GPU ({error}); see README, Troubleshooting: PhysX on the GPU")
 
 
 # ---------------------------------------------------------------- files and stages

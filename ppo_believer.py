@@ -50,9 +50,7 @@ from tqdm import tqdm
 FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
-BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
-if CUDA and __name__ == "__main__":  # asked in every simulator process, it would take GPU memory in each
-    BFLOAT16 = torch.cuda.is_bf16_supported(False)
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
@@ -79,7 +77,7 @@ class Args:
     mesh_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU that renders"""
+    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -446,7 +444,7 @@ def rollout_with_belief(
     V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
     episodes are played in rounds of envs.num_envs; noise is drawn before, so their size is nothing to physx_cpu.
     """
-    steps, count, (action_dim,) = envs.spec.max_episode_steps, len(seeds), envs.single_action_space.shape
+    steps, count, (action_dim,) = gym.spec(args.env_id).max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
     noise = torch.randn(steps, count, action_dim, device=device) * explore
     z_noise = torch.randn(steps + 1, count, n, config["z_dim"], device=device)
@@ -664,11 +662,13 @@ def main(args: Args) -> None:
         for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
             setattr(args, name, stored[name])
     check_task(args)
+    per_iteration = gym.spec(args.env_id).max_episode_steps * args.num_envs
+    num_iterations = max(1, args.total_timesteps // per_iteration)
     if not args.evaluate:
         path = open_run(args)
         resume = (path / "checkpoint.pt").exists()
         checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
-        if checkpoint.get("finished"):
+        if checkpoint.get("iteration") == num_iterations:
             print(f"{path} is finished; --overwrite makes it anew")
             return
         if not (path / "belief.pt").exists():
@@ -687,12 +687,11 @@ def main(args: Args) -> None:
         save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
         save(file.with_name("evaluation.mp4"), video)
         print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
+        envs.close()
         return
 
     agent.belief.load_state_dict(stored["belief"])
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    per_iteration = envs.spec.max_episode_steps * args.num_envs
-    num_iterations = max(1, args.total_timesteps // per_iteration)
     first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
@@ -745,9 +744,8 @@ def main(args: Args) -> None:
         for name, value in scalars.items():
             writer.add_scalar(name, value, global_step)
         writer.flush()
-        checkpoint = {"iteration": iteration, "finished": iteration == num_iterations, "rows": rows}
-        checkpoint |= {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()}
-        save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
+        states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()}
+        save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": rows, **states})
         bar.update(per_iteration)
     bar.close()
     envs.close()
@@ -853,15 +851,13 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
 
 
 def make_envs(args: Args) -> gym.vector.VectorEnv:
-    """Build environments whose episodes all last spec.max_episode_steps: actions in [-1, 1], no auto-reset.
+    """Build environments whose episodes all last max_episode_steps: actions in [-1, 1], no auto-reset.
 
     physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
     forked from one that has done the imports, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
-        envs = ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
-        envs.spec = gym.spec(args.env_id)  # ManiSkill's own does not know the number of steps
-        return envs
+        return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
     multiprocessing.resource_tracker.ensure_running()  # its start would lift the block
@@ -871,7 +867,6 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     gym.logger.min_level = gym.logger.ERROR  # that a run is stopped in the middle of a step deserves no warning
-    envs.spec = gym.spec(args.env_id)
     return envs
 
 
@@ -889,6 +884,11 @@ def check_task(args: Args) -> None:
         sapien.render.RenderSystem(sapien.Device(args.render_backend.removeprefix("sapien_")))
     except RuntimeError as error:
         fail(f"nothing renders with {args.render_backend} ({error}); see README, Troubleshooting: Vulkan driver")
+    try:
+        if args.sim_backend == "physx_cuda":
+            sapien.physx.enable_gpu()  # which downloads a library
+    except (OSError, RuntimeError) as error:
+        fail(f"PhysX does not start on the GPU ({error}); see README, Troubleshooting: PhysX on the GPU")
 
 
 # ---------------------------------------------------------------- files and stages

@@ -77,11 +77,11 @@ class MikasaAgent(torch.nn.Module):
         return policy, self.agent.critic(x)[:, 0]
 
 
-def mikasa(envs: object, seeds: np.ndarray) -> tuple[torch.nn.Module, dict, float]:
-    """Play one episode per seed with MIKASA-Robo's agent into its float32 buffers; agent, data, seconds."""
+def mikasa(envs: object, steps: int, seeds: np.ndarray) -> tuple[torch.nn.Module, dict, float]:
+    """Play an episode of so many steps per seed with MIKASA-Robo's agent into its float32 buffers; also the seconds."""
     from baselines.ppo.ppo_memtasks import Agent, DictArray
 
-    steps, device = envs.spec.max_episode_steps, torch.device("cpu")
+    device = torch.device("cpu")
     obs, _ = envs.reset(seed=seeds[: envs.num_envs].tolist())
     sample = {"rgb": torch.as_tensor(obs["rgb"]), "state": torch.as_tensor(obs["joints"])}
     shell = SimpleNamespace(unwrapped=SimpleNamespace(single_action_space=envs.single_action_space))
@@ -171,7 +171,7 @@ def rollout_rate(env_id: str, cores: set[int], episodes: int) -> float:
     seeds = np.arange(episodes)
     seconds = [timed(ppo_aib.rollout_with_belief, envs, agent, args, seeds)[1] for _ in range(2)]
     envs.close()
-    return episodes * envs.spec.max_episode_steps / min(seconds)
+    return episodes * ppo_aib.gym.spec(env_id).max_episode_steps / min(seconds)
 
 
 def afresh(function: Callable, *arguments: object) -> object:
@@ -216,7 +216,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
         data, seconds = timed(ppo_baseline.rollout, envs, agent, settings, seeds)
         times["our rollout"].append(seconds)
         times["our update"].append(update(agent, data, settings))
-        their_agent, their_data, seconds = mikasa(envs, seeds)
+        their_agent, their_data, seconds = mikasa(envs, len(data["reward"]), seeds)
         times["mikasa rollout"].append(seconds)
         times["mikasa update"].append(update(their_agent, their_data, settings))
     median = {name: statistics.median(values) for name, values in times.items()}
@@ -234,7 +234,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
         measured = []
         for _ in range(args.repeats):
             clock.seconds = 0.0
-            _, seconds = timed(play, envs, player, ppo_aib.Args(device="cpu"), seeds)
+            _, seconds = timed(play, envs, player, ppo_aib.Args(env_id=args.env_id), seeds)
             measured.append(1 - clock.seconds / seconds)
         yield f"{name}, rollout", f"{statistics.median(measured):.1%} of the time is not simulator"
     envs.close()

@@ -74,7 +74,7 @@ def test_the_batch_of_physx_cuda_is_played_and_recorded(
 
     envs = ppo_baseline.make_envs(ppo_baseline.Args(env_id=TASK, sim_backend="physx_cuda", num_envs=1))
     agent = ppo_baseline.Agent([128, 128, 3], 25, 8, 0.6)
-    data = ppo_baseline.rollout(envs, agent, ppo_baseline.Args(device="cpu"), np.array([5, 6]))
+    data = ppo_baseline.rollout(envs, agent, ppo_baseline.Args(env_id=TASK), np.array([5, 6]))
     assert data["rgb"].shape == (60, 2, 128, 128, 3) and data["value"].shape == (61, 2)
     for i, seed in enumerate((5, 6)):
         assert np.array_equal(data["rgb"][0, i], env.reset(seed=seed)[0]["rgb"])

@@ -56,6 +56,16 @@ def test_light_meshes_only_where_there_is_one_scene_per_process(capsys: pytest.C
     refused((stop.value.code, *capsys.readouterr()), "meshes of 500 triangles", "physx_cpu")
 
 
+def test_physx_without_its_library(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    def enable_gpu() -> None:
+        raise OSError("libcuda.so: cannot open shared object file")
+
+    monkeypatch.setattr(aib_repr.sapien.physx, "enable_gpu", enable_gpu)
+    with pytest.raises(SystemExit) as stop:
+        aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", mesh_triangles=0))
+    refused((stop.value.code, *capsys.readouterr()), "PhysX", "libcuda.so", "Troubleshooting")
+
+
 def test_a_folder_that_cannot_be_written() -> None:
     """Even root may not make a folder in /sys."""
     refused(run("ppo_baseline", cwd=Path("/sys")), "cannot be written")

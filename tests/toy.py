@@ -1,7 +1,7 @@
 """A toy memory task instead of the simulator, for tests of learning: it stands in for make_envs and check_task."""
 
 from collections.abc import Callable
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +21,6 @@ class ToyMemory(gym.vector.VectorEnv):
 
     def __init__(self, num_envs: int):
         self.num_envs = num_envs
-        self.spec = SimpleNamespace(max_episode_steps=self.STEPS)
         rgb = gym.spaces.Box(0, 255, (self.SIZE, self.SIZE, 3), np.uint8)
         joints = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.single_observation_space = gym.spaces.Dict({"rgb": rgb, "joints": joints})
@@ -62,6 +61,9 @@ class ToyMemory(gym.vector.VectorEnv):
         reward = (near * (self.t > self.GO)).astype(np.float32)
         ends = np.full(self.num_envs, self.t == self.STEPS)
         return obs, reward, np.zeros_like(ends), ends, info
+
+
+gym.register("ToyMemory-v0", ToyMemory, max_episode_steps=ToyMemory.STEPS)
 
 
 def make_envs(args: object) -> ToyMemory:
