@@ -234,7 +234,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
         measured = []
         for _ in range(args.repeats):
             clock.seconds = 0.0
-            _, seconds = timed(play, envs, player, ppo_aib.Args(env_id=args.env_id), seeds)
+            _, seconds = timed(play, envs, player, ppo_aib.Args(env_id=args.env_id, device="cpu"), seeds)
             measured.append(1 - clock.seconds / seconds)
         yield f"{name}, rollout", f"{statistics.median(measured):.1%} of the time is not simulator"
     envs.close()
