@@ -1,5 +1,6 @@
 """The real simulator on the CPU: what a task shows, what only the simulator knows, and that episodes repeat."""
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -7,10 +8,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import sapien
+import torch
 
 import aib_repr
 import ppo_baseline
-from conftest import TASK
+from conftest import ROOT, TASK
+
+sys.path.append(str(ROOT / "benchmark"))
+import true_state  # noqa: E402
 
 # RememberColor9's nine colours have six hues on the screen: maroon is a dark red, olive reads as yellow, teal as cyan
 HUES = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [255, 0, 255], [0, 255, 255]])
@@ -78,6 +83,19 @@ def test_the_batch_of_physx_cuda_is_played_and_recorded(
     assert data["rgb"].shape == (60, 2, 128, 128, 3) and data["value"].shape == (61, 2)
     for i, seed in enumerate((5, 6)):
         assert np.array_equal(data["rgb"][0, i], env.reset(seed=seed)[0]["rgb"])
+
+
+def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.Env) -> None:
+    shown = true_state.ShowState(env)
+    for obs, *_, info in (shown.reset(seed=3), shown.step(np.zeros(8, np.float32))):
+        assert obs in shown.observation_space and obs["rgb"].shape == (1, 1, 3)
+        assert np.array_equal(obs["joints"][25:], info["state"]) and info["state"].any()
+    agent = true_state.StateAgent([1, 1, 3], len(obs["joints"]), 8, init_std=0.3, amp=False)
+    joints = torch.from_numpy(np.stack([obs["joints"], obs["joints"]]))
+    joints[1, -1] += 1
+    policy, value = agent({"joints": joints})
+    assert policy.mean.shape == (2, 8) and value[0] != value[1], "it sees the state"
+    del env.unwrapped._get_obs_sensor_data
 
 
 def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:

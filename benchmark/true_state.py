@@ -1,0 +1,76 @@
+"""How far would a perfect belief get? PPO as in ppo_baseline.py, on joints and the true privileged state, no pictures.
+
+Tells a belief that fails from a budget that is too small, at several times the speed.
+
+Usage:   python benchmark/true_state.py --env-id RememberColor5-v0 --small
+Takes:   the arguments of ppo_baseline.py; always simulates on the CPU
+Writes:  runs/{env_id}__true_state__{seed}/ (or true_state_small), as ppo_baseline.py does; its videos are empty
+"""
+
+import math
+import os
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+import torch.nn as nn
+from torch.distributions import Normal
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+import ppo_baseline  # noqa: E402
+from ppo_baseline import orthogonal_init  # noqa: E402
+
+
+class ShowState(gym.Wrapper):
+    """Joints (25 + D,) float32 with the privileged state at their end; rgb is one black pixel, nothing is drawn."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        black = {"base_camera": {"rgb": torch.zeros(1, 1, 1, 3, dtype=torch.uint8)}}
+        env.unwrapped._get_obs_sensor_data = lambda: black
+        size = self.reset()[0]["joints"].shape
+        spaces = {"rgb": gym.spaces.Box(0, 255, (1, 1, 3), np.uint8), "joints": gym.spaces.Box(-np.inf, np.inf, size)}
+        self.observation_space = gym.spaces.Dict(spaces)
+
+    def reset(self, **kwargs: object) -> tuple:
+        obs, info = self.env.reset(**kwargs)
+        return {**obs, "joints": np.append(obs["joints"], info["state"])}, info
+
+    def step(self, action: np.ndarray) -> tuple:
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return {**obs, "joints": np.append(obs["joints"], info["state"])}, reward, terminated, truncated, info
+
+
+class StateAgent(nn.Module):
+    """Actor and critic on joints and state, in the sizes of ppo_baseline.Agent."""
+
+    def __init__(self, image_shape: list[int], joints_dim: int, action_dim: int, init_std: float, amp: bool):
+        super().__init__()
+        self.joints = orthogonal_init(nn.Sequential(nn.Linear(joints_dim, 256 + 128), nn.ReLU()))
+        self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
+        self.critic = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, 1)))
+        orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
+        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(init_std)))
+
+    def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
+        """Policy over actions (B, A) and value (B,) of joints (B, 25 + D)."""
+        x = self.joints(obs["joints"])
+        mean = torch.tanh(self.actor(x))
+        return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
+
+
+def make_envs(args: ppo_baseline.Args) -> gym.vector.VectorEnv:
+    """Up to args.num_workers processes of one scene each, all episodes of max_episode_steps, no auto-reset."""
+    os.environ.update(OMP_NUM_THREADS="1")  # of the workers
+    workers = [lambda: ShowState(ppo_baseline.make_task(args, 1))] * min(args.num_workers, args.num_envs)
+    return gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
+
+
+if __name__ == "__main__":
+    ppo_baseline.Agent, ppo_baseline.make_envs = StateAgent, make_envs
+    ppo_baseline.make_video = lambda data: b""
+    args = ppo_baseline.parse_args(ppo_baseline.TASKS, ppo_baseline.SMALL, ppo_baseline.QUICK)
+    args.exp_name, args.sim_backend = args.exp_name.replace("ppo_baseline", "true_state"), "physx_cpu"
+    ppo_baseline.main(args)
