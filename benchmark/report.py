@@ -13,7 +13,7 @@ import csv
 import json
 import sys
 import textwrap
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -173,23 +173,24 @@ def main_table(runs: dict, key: tuple[str, str]) -> str:
     return "\n".join(lines)
 
 
-def read_beliefs(folder: Path) -> dict[str, dict[str, list[dict]]]:
-    """diagnostics.json of every --small belief below folder, a list over seeds by task and by what was trained.
+def read_beliefs(folder: Path) -> dict[str, dict[tuple[str, str], list[dict]]]:
+    """diagnostics.json of every --small belief below folder, a list over seeds by task and (method, setting).
 
-    What was trained is read from args.json; a "note" in it tells what stage 2's arguments cannot.
+    Both are read from args.json; a "note" in it tells what stage 2's arguments cannot.
     """
     found = defaultdict(lambda: defaultdict(list))
     for file in sorted(folder.glob("*_small*__*/diagnostics.json")):
         args = json.loads((file.parent / "args.json").read_text())
         head, size = args.get("action_head"), (args["num_episodes"], args["num_updates"])
-        label = f"{BELIEFS[head]}, {size[0]:,} episodes, {size[1]:,} updates"
+        setting = f"{size[0]:,} episodes, {size[1]:,} updates"
         for name, default in BELIEF_DEFAULTS.items():
             if args.get(name, default) != default:
-                label += f", {name} {args[name]}"
+                setting += f", {name} {args[name]}"
         if "note" in args:
-            label += f", {args['note']}"
-        found[args["env_id"]][size, list(BELIEFS).index(head), label].append(json.loads(file.read_text()))
-    return {task: {key[-1]: rows[key] for key in sorted(rows)} for task, rows in found.items()}
+            setting += f", {args['note']}"
+        method = list(BELIEFS).index(head), BELIEFS[head]
+        found[args["env_id"]][size, setting, method].append(json.loads(file.read_text()))
+    return {task: {(key[2][1], key[1]): rows[key] for key in sorted(rows)} for task, rows in found.items()}
 
 
 def belief_cell(reports: list[dict], column: str) -> str:
@@ -205,7 +206,7 @@ def belief_cell(reports: list[dict], column: str) -> str:
     return " / ".join(cells)
 
 
-def belief_table(task: str, rows: dict[str, list[dict]]) -> str:
+def belief_table(task: str, rows: dict[tuple[str, str], list[dict]]) -> str:
     """What the beliefs of one task remember of held-out episodes, in Markdown."""
     first = next(iter(rows.values()))[0]
     head = f"{task}: steps 4 / 9 / 30 / last; cue: chance {first['cue_chance']:.2f}"
@@ -215,22 +216,31 @@ def belief_table(task: str, rows: dict[str, list[dict]]) -> str:
         "| belief | seeds | " + " | ".join(BELIEF_COLUMNS) + " |",
         "|" + "---|" * (len(BELIEF_COLUMNS) + 2),
     ]
-    for label, reports in rows.items():
+    for (method, setting), reports in rows.items():
         cells = [belief_cell(reports, column) for column in BELIEF_COLUMNS.values()]
-        lines.append(f"| {label} | {len(reports)} | " + " | ".join(cells) + " |")
+        lines.append(f"| {method}, {setting} | {len(reports)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def belief_figure(beliefs: dict, path: Path) -> None:
-    """Cue and R² of u from the mean particle against the time step, three tasks in a row, means over seeds."""
+    """Cue and R² of u from the mean particle against the time step, three tasks in a row, mean ± std over seeds.
+
+    Of each task the setting that most beliefs share, or all of them where no two beliefs share one.
+    """
     height = -(-len(beliefs) // 3)
     figure = plt.figure(figsize=(15, 6.5 * height), layout="constrained")
     for part, (task, rows) in zip(figure.subfigures(height, 3, squeeze=False).flat, beliefs.items(), strict=False):
-        axes = part.subplots(2, 1)
+        axes, beliefs_of = part.subplots(2, 1), Counter()
+        for (_, setting), reports in rows.items():
+            beliefs_of[setting] += len(reports)
         for ax, name, title in zip(axes, ("cue_from_particle", "u_r2_prior"), ("cue", "R² of u"), strict=True):
-            for label, reports in rows.items():
-                label = textwrap.fill(f"{label} ({len(reports)})", 60)
-                ax.plot(np.mean([report[name] for report in reports], 0), label=label)
+            for (method, setting), reports in rows.items():
+                if beliefs_of[setting] == max(beliefs_of.values()):
+                    values = np.array([report[name] for report in reports])
+                    mean, spread = values.mean(0), values.std(0, ddof=len(reports) > 1)
+                    label = textwrap.fill(f"{method}, {setting} ({len(reports)})", 60)
+                    (line,) = ax.plot(mean, label=label)
+                    ax.fill_between(range(len(mean)), mean - spread, mean + spread, color=line.get_color(), alpha=0.2)
             ax.set(xlabel="step", ylabel=title, ylim=(-0.3, 1.05))
             ax.grid(alpha=0.3)
         axes[0].axhline(next(iter(rows.values()))[0]["cue_chance"], color="grey", linestyle="--", label="chance")
@@ -257,7 +267,8 @@ def small_report(runs: dict, beliefs: dict, output: Path) -> None:
     lines += ["", "![success_once](small.png)", ""]
     if beliefs:
         belief_figure(beliefs, output / "belief.png")
-        lines += ["# What the beliefs remember of held-out episodes", "", "In brackets: seeds.", ""]
+        shown = "The figure shows of each task the setting that most beliefs share; in brackets: seeds."
+        lines += ["# What the beliefs remember of held-out episodes", "", shown, ""]
         lines += ["![cue and u from the mean particle](belief.png)"]
         lines += ["\n" + belief_table(task, rows) for task, rows in beliefs.items()]
     (output / "small.md").write_text("\n".join(lines) + "\n")
