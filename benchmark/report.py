@@ -188,9 +188,9 @@ def read_beliefs(folder: Path) -> dict[str, dict[tuple[str, str], list[dict]]]:
                 setting += f", {name} {args[name]}"
         if "note" in args:
             setting += f", {args['note']}"
-        method = list(BELIEFS).index(head), BELIEFS[head]
-        found[args["env_id"]][size, setting, method].append(json.loads(file.read_text()))
-    return {task: {(key[2][1], key[1]): rows[key] for key in sorted(rows)} for task, rows in found.items()}
+        place = size, setting, list(BELIEFS).index(head)  # rows in this order
+        found[args["env_id"]][*place, BELIEFS[head]].append(json.loads(file.read_text()))
+    return {task: {(key[3], key[1]): rows[key] for key in sorted(rows)} for task, rows in found.items()}
 
 
 def belief_cell(reports: list[dict], column: str) -> str:
