@@ -19,6 +19,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import zlib
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -326,6 +327,7 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
+    stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
     try:
@@ -385,8 +387,7 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
     fit and test are encode's of two sets of episodes that the belief was not trained on: read-outs are fitted on the
     first and everything is measured on the second.
     """
-    nll, nll_posterior = test["nll_prior"].mean().item(), test["nll_posterior"].mean().item()
-    report = {"nll_prior": nll, "nll_posterior": nll_posterior, "prior_gap": nll - nll_posterior}
+    report = {name: test[name].mean().item() for name in ("nll_prior", "nll_posterior")}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
         residual = (test["u"] - test[source]).square().sum((0, 2))
         report[name] = (1 - residual / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
@@ -450,7 +451,8 @@ def main(args: Args) -> None:
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first = 0
     if (path / "checkpoint.pt").exists():
-        checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
+        hint = "start anew with --overwrite"
+        checkpoint = load(path / "checkpoint.pt", hint, kind="checkpoint", repr_crc=stored["crc"])
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         first = checkpoint["update"]
@@ -480,7 +482,7 @@ def main(args: Args) -> None:
             bar.set_postfix(held_out_error=f"{error:.3f}")
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
+            save(path / "checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
 
     # the last weights: held-out error and likelihood are best before the belief remembers
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
@@ -489,9 +491,6 @@ def main(args: Args) -> None:
         report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["action"])
         sampled = flow_gain(model["head"], test["z"], test["action"])
         report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
-    for name, values in report.items():  # curves over an episode's steps
-        for step, value in enumerate(values if isinstance(values, list) else []):
-            writer.add_scalar(f"by_time_step/{name}", value, step)
     writer.close()
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     some = fit["particle"][:, ::8]  # every 8th step is enough

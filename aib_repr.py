@@ -483,13 +483,10 @@ def check_task(args: Args) -> None:
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")
     try:
         sapien.render.RenderSystem(sapien.Device(args.render_backend.removeprefix("sapien_")))
-    except RuntimeError as error:
-        fail(f"nothing renders with {args.render_backend} ({error}); see README, Troubleshooting: Vulkan driver")
-    try:
         if args.sim_backend == "physx_cuda":
             sapien.physx.enable_gpu()  # which downloads a library
     except (OSError, RuntimeError) as error:
-        fail(f"PhysX does not start on the GPU ({error}); see README, Troubleshooting: PhysX on the GPU")
+        fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see README, Troubleshooting")
 
 
 # ---------------------------------------------------------------- files and stages

@@ -287,7 +287,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, torch.Tensor], args: Args) -> 
     policy, value = agent(batch)
     log_ratio = policy.log_prob(batch["action"]).sum(-1) - batch["logprob"]
     ratio = log_ratio.exp()
-    advantage = (batch["advantage"] - batch["advantage"].mean()) / (batch["advantage"].std() + 1e-8)
+    advantage = (batch["advantage"] - batch["advantage"].mean()) / (batch["advantage"].std(correction=0) + 1e-8)
     clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = -torch.min(ratio * advantage, clipped * advantage).mean()
     value_loss = 0.5 * (value - batch["return"]).square().mean()
@@ -313,7 +313,7 @@ def rollout_with_belief(
 
     Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
     V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs; noise is drawn before, so their size is nothing to physx_cpu.
+    episodes are played in rounds of envs.num_envs; noise is drawn before: on physx_cpu their size is no matter.
     """
     steps, count, (action_dim,) = gym.spec(args.env_id).max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
@@ -426,6 +426,9 @@ def main(args: Args) -> None:
         hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_belief.py --overwrite"
         task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
         stored = load(file, hint, kind="aib_belief", **task)
+        begun = checkpoint.get("agent", {})
+        if any(not torch.equal(begun.get(f"belief.{name}", x), x) for name, x in stored["belief"].items()):
+            fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
 
     envs, device = make_envs(args), torch.device(args.device)
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
@@ -463,17 +466,15 @@ def main(args: Args) -> None:
         data["advantage"] = compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
         data["return"] = data["advantage"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in data.items()}
-        for _ in range(args.update_epochs):
-            for index in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
-                losses = ppo_losses(agent, {name: x[index] for name, x in batch.items()}, args)
-                if losses["approx_kl"] > args.target_kl:
-                    break
-                optimizer.zero_grad()
-                losses["total"].backward()
-                nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
-                optimizer.step()
+        orders = [torch.randperm(per_iteration, device=device) for _ in range(args.update_epochs)]
+        for index in [part for order in orders for part in order.tensor_split(args.num_minibatches)]:
+            losses = ppo_losses(agent, {name: x[index] for name, x in batch.items()}, args)
             if losses["approx_kl"] > args.target_kl:
                 break
+            optimizer.zero_grad()
+            losses["total"].backward()
+            nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
+            optimizer.step()
         scalars |= {f"losses/{name}": value.item() for name, value in losses.items()}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
@@ -633,13 +634,10 @@ def check_task(args: Args) -> None:
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")
     try:
         sapien.render.RenderSystem(sapien.Device(args.render_backend.removeprefix("sapien_")))
-    except RuntimeError as error:
-        fail(f"nothing renders with {args.render_backend} ({error}); see README, Troubleshooting: Vulkan driver")
-    try:
         if args.sim_backend == "physx_cuda":
             sapien.physx.enable_gpu()  # which downloads a library
     except (OSError, RuntimeError) as error:
-        fail(f"PhysX does not start on the GPU ({error}); see README, Troubleshooting: PhysX on the GPU")
+        fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see README, Troubleshooting")
 
 
 # ---------------------------------------------------------------- files and stages

@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
@@ -376,7 +377,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, torch.Tensor], args: Args) -> 
     policy, value = agent(batch)
     log_ratio = policy.log_prob(batch["action"]).sum(-1) - batch["logprob"]
     ratio = log_ratio.exp()
-    advantage = (batch["advantage"] - batch["advantage"].mean()) / (batch["advantage"].std() + 1e-8)
+    advantage = (batch["advantage"] - batch["advantage"].mean()) / (batch["advantage"].std(correction=0) + 1e-8)
     clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = -torch.min(ratio * advantage, clipped * advantage).mean()
     value_loss = 0.5 * (value - batch["return"]).square().mean()
@@ -424,6 +425,7 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
+    stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
     try:
@@ -442,7 +444,7 @@ def rollout_with_belief(
 
     Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
     V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs; noise is drawn before, so their size is nothing to physx_cpu.
+    episodes are played in rounds of envs.num_envs; noise is drawn before: on physx_cpu their size is no matter.
     """
     steps, count, (action_dim,) = gym.spec(args.env_id).max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
@@ -526,8 +528,7 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
     fit and test are encode's of two sets of episodes that the belief was not trained on: read-outs are fitted on the
     first and everything is measured on the second.
     """
-    nll, nll_posterior = test["nll_prior"].mean().item(), test["nll_posterior"].mean().item()
-    report = {"nll_prior": nll, "nll_posterior": nll_posterior, "prior_gap": nll - nll_posterior}
+    report = {name: test[name].mean().item() for name in ("nll_prior", "nll_posterior")}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
         residual = (test["u"] - test[source]).square().sum((0, 2))
         report[name] = (1 - residual / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
@@ -606,7 +607,8 @@ def train_belief(args: Args, path: Path) -> None:
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first = 0
     if (path / "belief_checkpoint.pt").exists():
-        checkpoint = load(path / "belief_checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
+        hint = "start anew with --overwrite"
+        checkpoint = load(path / "belief_checkpoint.pt", hint, kind="checkpoint", repr_crc=stored["crc"])
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         first = checkpoint["update"]
@@ -636,14 +638,11 @@ def train_belief(args: Args, path: Path) -> None:
             bar.set_postfix(held_out_error=f"{error:.3f}")
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            save(path / "belief_checkpoint.pt", {"kind": "checkpoint", **checkpoint})
+            save(path / "belief_checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
 
     # the last weights: held-out error and likelihood are best before the belief remembers
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = diagnose_belief(fit, test)
-    for name, values in report.items():  # curves over an episode's steps
-        for step, value in enumerate(values if isinstance(values, list) else []):
-            writer.add_scalar(f"by_time_step/{name}", value, step)
     writer.close()
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     some = fit["particle"][:, ::8]  # every 8th step is enough
@@ -712,17 +711,15 @@ def main(args: Args) -> None:
         data["advantage"] = compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
         data["return"] = data["advantage"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in data.items()}
-        for _ in range(args.update_epochs):
-            for index in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
-                losses = ppo_losses(agent, {name: x[index] for name, x in batch.items()}, args)
-                if losses["approx_kl"] > args.target_kl:
-                    break
-                optimizer.zero_grad()
-                losses["total"].backward()
-                nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
-                optimizer.step()
+        orders = [torch.randperm(per_iteration, device=device) for _ in range(args.update_epochs)]
+        for index in [part for order in orders for part in order.tensor_split(args.num_minibatches)]:
+            losses = ppo_losses(agent, {name: x[index] for name, x in batch.items()}, args)
             if losses["approx_kl"] > args.target_kl:
                 break
+            optimizer.zero_grad()
+            losses["total"].backward()
+            nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
+            optimizer.step()
         scalars |= {f"losses/{name}": value.item() for name, value in losses.items()}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
@@ -882,13 +879,10 @@ def check_task(args: Args) -> None:
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")
     try:
         sapien.render.RenderSystem(sapien.Device(args.render_backend.removeprefix("sapien_")))
-    except RuntimeError as error:
-        fail(f"nothing renders with {args.render_backend} ({error}); see README, Troubleshooting: Vulkan driver")
-    try:
         if args.sim_backend == "physx_cuda":
             sapien.physx.enable_gpu()  # which downloads a library
     except (OSError, RuntimeError) as error:
-        fail(f"PhysX does not start on the GPU ({error}); see README, Troubleshooting: PhysX on the GPU")
+        fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see README, Troubleshooting")
 
 
 # ---------------------------------------------------------------- files and stages

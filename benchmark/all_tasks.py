@@ -4,6 +4,9 @@ Usage:   python benchmark/all_tasks.py                        (all 29)
          python benchmark/all_tasks.py --tasks TakeItBack-v0
 """
 
+import os
+
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # sizes of one scene on a CPU, also where there is a GPU
 import subprocess
 import sys
 import time

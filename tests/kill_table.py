@@ -77,11 +77,13 @@ def flatten(x: object) -> object:
 
 def curves(folder: Path) -> dict[str, list]:
     """TensorBoard's curves as (step, value), without those that measure time; each step must be there once."""
-    events = EventAccumulator(str(folder)).Reload()
-    tags = [tag for tag in events.Tags()["scalars"] if not tag.startswith(("time/", "charts/"))]
-    return {
-        tag: [(row.step, repr(row.value)) for row in events.Scalars(tag)] for tag in tags
-    }  # nan too is equal to nan
+    found = {}
+    for part in (folder, folder / "belief_events"):  # Believer's belief has its own
+        events = EventAccumulator(str(part)).Reload() if part.exists() else None
+        for tag in events.Tags()["scalars"] if events else ():
+            if not tag.startswith(("time/", "charts/")):
+                found[tag] = [(row.step, repr(row.value)) for row in events.Scalars(tag)]  # nan too is equal to nan
+    return found
 
 
 def readable(folder: Path) -> bool:

@@ -67,12 +67,9 @@ def test_stages_leave_their_diagnostics(quick_runs: Path) -> None:
     for name in ("aib_belief", "ppo_believer"):
         path = quick_runs / f"{TASK}__{name}_quick__1"
         report = json.loads((path / "diagnostics.json").read_text())
-        assert {"nll_prior", "nll_posterior", "prior_gap", "action_readout", "cue_chance"} <= report.keys()
+        assert {"nll_prior", "nll_posterior", "action_readout", "cue_chance"} <= report.keys()
         assert len(report["cue_from_h"]) == len(report["u_r2_prior"]) == 61
         assert ("flow_gain" in report) == (name == "aib_belief")
-        events = EventAccumulator(str(path if name == "aib_belief" else path / "belief_events")).Reload()
-        curve = [row.value for row in events.Scalars("by_time_step/cue_from_h")]
-        assert np.allclose(curve, report["cue_from_h"])
     events = EventAccumulator(str(quick_runs / f"{TASK}__aib_repr_quick__1")).Reload()
     assert 0 <= events.Scalars("held_out/active_dimensions")[-1].value <= 16
 

@@ -46,7 +46,7 @@ def test_tasks(tmp_path: Path, script: str, arguments: list[str], words: list[st
 
 
 def test_no_rendering_device(tmp_path: Path) -> None:
-    refused(run("aib_repr", cwd=tmp_path, env=NO_DRIVER), "nothing renders", "Troubleshooting")
+    refused(run("aib_repr", cwd=tmp_path, env=NO_DRIVER), "sapien_cpu or physx_cpu does not start", "Troubleshooting")
     assert not list(tmp_path.iterdir())
 
 
@@ -63,7 +63,7 @@ def test_physx_without_its_library(capsys: pytest.CaptureFixture, monkeypatch: p
     monkeypatch.setattr(aib_repr.sapien.physx, "enable_gpu", enable_gpu)
     with pytest.raises(SystemExit) as stop:
         aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", mesh_triangles=0))
-    refused((stop.value.code, *capsys.readouterr()), "PhysX", "libcuda.so", "Troubleshooting")
+    refused((stop.value.code, *capsys.readouterr()), "physx_cuda does not start", "libcuda.so", "Troubleshooting")
 
 
 def test_a_folder_that_cannot_be_written() -> None:
@@ -247,6 +247,22 @@ def test_a_second_process_is_refused(toy_task: Path, capfd: pytest.CaptureFixtur
         train(ppo_baseline, **PPO)
     os.close(lock)
     refused((stop.value.code, *capfd.readouterr()), "is another process's")
+
+
+def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.CaptureFixture) -> None:
+    """Stopped runs whose earlier stage was made anew in the meantime."""
+    train(ppo_aib, **PPO, num_episodes=20)
+    change(Path(f"runs/{TOY}__ppo_aib__1/checkpoint.pt"), iteration=0)()
+    weights = torch.load(BELIEF_PT, weights_only=True)["belief"]
+    change(BELIEF_PT, belief={name: 1.01 * x for name, x in weights.items()})()
+    with pytest.raises(SystemExit) as stop:
+        train(ppo_aib, **PPO, num_episodes=20)
+    refused((stop.value.code, *capfd.readouterr()), "began with another belief", "--overwrite")
+    BELIEF_PT.unlink()
+    change(REPR_PT, seed=2)()
+    with pytest.raises(SystemExit) as stop:
+        train(aib_belief, num_episodes=20, num_updates=3, batch_episodes=4)
+    refused((stop.value.code, *capfd.readouterr()), "has repr_crc", "--overwrite")
 
 
 def test_overwrite_starts_anew(folder: Path) -> None:
