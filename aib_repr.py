@@ -105,7 +105,6 @@ class Args:
 
 
 SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, epochs=7, batch_size=100, learning_rate=1e-3)
-SMALL |= dict(kl_coef=0.01)  # what the committed PPO runs were made with
 QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_share=0.5, epochs=2)
 
 
