@@ -1,15 +1,19 @@
 """How far would a perfect belief get? PPO as in ppo_baseline.py, on joints and the true privileged state, no pictures.
 
-Tells a belief that fails from a budget that is too small, at several times the speed.
+Tells a belief that fails from a budget that is too small, at several times the speed. With --phi the policy sees u in
+place of the state: what a belief is trained to know, where the state is facts that have to be put together first.
 
 Usage:   python benchmark/true_state.py --env-id RememberColor5-v0 --small
+         python benchmark/true_state.py --env-id RememberColor5-v0 --small --phi 'runs/{env_id}__aib_repr_small__{seed}'
 Takes:   the arguments of ppo_baseline.py; always simulates on the CPU
-Writes:  runs/{env_id}__true_state__{seed}/ (or true_state_small), as ppo_baseline.py does; its videos are empty
+Writes:  runs/{env_id}__true_state__{seed}/ (true_u with --phi; or …_small), as ppo_baseline.py does; empty videos
 """
 
 import math
 import os
 import sys
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -20,7 +24,14 @@ from torch.distributions import Normal
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 import ppo_baseline  # noqa: E402
+from aib_belief import StateEncoder  # noqa: E402
 from ppo_baseline import orthogonal_init  # noqa: E402
+
+
+@dataclass
+class Args(ppo_baseline.Args):
+    phi: str | None = None
+    """run directory of stage 1, whose state encoder turns the state into u; None: the state itself"""
 
 
 class ShowState(gym.Wrapper):
@@ -44,11 +55,21 @@ class ShowState(gym.Wrapper):
 
 
 class StateAgent(nn.Module):
-    """Actor and critic on joints and state, in the sizes of ppo_baseline.Agent."""
+    """Actor and critic on joints and state, or u in its place, in the sizes of ppo_baseline.Agent."""
 
-    def __init__(self, image_shape: list[int], joints_dim: int, action_dim: int, init_std: float, amp: bool):
+    def __init__(
+        self,
+        image_shape: list[int],
+        joints_dim: int,
+        action_dim: int,
+        init_std: float,
+        amp: bool,
+        phi: StateEncoder | None = None,
+    ):
         super().__init__()
-        self.joints = orthogonal_init(nn.Sequential(nn.Linear(joints_dim, 256 + 128), nn.ReLU()))
+        self.phi = phi
+        input_dim = 25 + phi(phi.mean).mean.numel() if phi else joints_dim
+        self.joints = orthogonal_init(nn.Sequential(nn.Linear(input_dim, 256 + 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
         self.critic = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, 1)))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
@@ -56,7 +77,10 @@ class StateAgent(nn.Module):
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of joints (B, 25 + D)."""
-        x = self.joints(obs["joints"])
+        x = obs["joints"]
+        if self.phi:
+            x = torch.cat([x[:, :25], self.phi(x[:, 25:]).mean], -1)
+        x = self.joints(x)
         mean = torch.tanh(self.actor(x))
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
 
@@ -68,9 +92,21 @@ def make_envs(args: ppo_baseline.Args) -> gym.vector.VectorEnv:
     return gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
 
 
+def load_phi(args: Args) -> StateEncoder:
+    """Stage 1's state encoder from args.phi, frozen."""
+    path = Path(args.phi.format(**vars(args))) / "repr.pt"
+    stored = ppo_baseline.load(path, "name a run of aib_repr.py with --phi", env_id=args.env_id, kind="repr")
+    phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
+    phi.load_state_dict(stored["phi"])
+    return phi.requires_grad_(False)
+
+
 if __name__ == "__main__":
-    ppo_baseline.Agent, ppo_baseline.make_envs = StateAgent, make_envs
-    ppo_baseline.make_video = lambda data: b""
+    ppo_baseline.Args = Args
     args = ppo_baseline.parse_args(ppo_baseline.TASKS, ppo_baseline.SMALL, ppo_baseline.QUICK)
-    args.exp_name, args.sim_backend = args.exp_name.replace("ppo_baseline", "true_state"), "physx_cpu"
+    phi = load_phi(args) if args.phi else None
+    ppo_baseline.Agent, ppo_baseline.make_envs = partial(StateAgent, phi=phi), make_envs
+    ppo_baseline.make_video = lambda data: b""
+    name = "true_u" if phi else "true_state"
+    args.exp_name, args.sim_backend = args.exp_name.replace("ppo_baseline", name), "physx_cpu"
     ppo_baseline.main(args)

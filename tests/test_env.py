@@ -10,6 +10,7 @@ import pytest
 import sapien
 import torch
 
+import aib_belief
 import aib_repr
 import ppo_baseline
 from conftest import ROOT, TASK
@@ -95,6 +96,12 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
     joints[1, -1] += 1
     policy, value = agent({"joints": joints})
     assert policy.mean.shape == (2, 8) and value[0] != value[1], "it sees the state"
+    phi = aib_belief.StateEncoder(len(info["state"]), 16)
+    agent = true_state.StateAgent([1, 1, 3], len(obs["joints"]), 8, init_std=0.3, amp=False, phi=phi)
+    assert agent.joints[0].in_features == 25 + 16
+    first = agent({"joints": joints})[1]
+    phi.mean[-1] += 1  # now the second state is to phi what the first was
+    assert torch.allclose(agent({"joints": joints})[1][1], first[0]), "it sees u"
     del env.unwrapped._get_obs_sensor_data
 
 
