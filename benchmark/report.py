@@ -225,7 +225,8 @@ def belief_table(task: str, rows: dict[tuple[str, str], list[dict]]) -> str:
 def belief_figure(beliefs: dict, path: Path) -> None:
     """Cue and R² of u from the mean particle against the time step, three tasks in a row, mean ± std over seeds.
 
-    Of each task the setting that most beliefs share, or all of them where no two beliefs share one.
+    Of each task the setting that most beliefs share, or all of them where no two beliefs share one; dashed the flow
+    belief of any setting that knows most of u at the last step.
     """
     height = -(-len(beliefs) // 3)
     figure = plt.figure(figsize=(15, 6.5 * height), layout="constrained")
@@ -233,17 +234,20 @@ def belief_figure(beliefs: dict, path: Path) -> None:
         axes, beliefs_of = part.subplots(2, 1), Counter()
         for (_, setting), reports in rows.items():
             beliefs_of[setting] += len(reports)
+        flow = [row for row in rows if row[0] == BELIEFS["flow"]]
+        best = max(flow, key=lambda row: np.mean([report["u_r2_prior"][-1] for report in rows[row]]), default=None)
         for ax, name, title in zip(axes, ("cue_from_particle", "u_r2_prior"), ("cue", "R² of u"), strict=True):
             for (method, setting), reports in rows.items():
-                if beliefs_of[setting] == max(beliefs_of.values()):
+                shared = beliefs_of[setting] == max(beliefs_of.values())
+                if shared or (method, setting) == best:
                     values = np.array([report[name] for report in reports])
                     mean, spread = values.mean(0), values.std(0, ddof=len(reports) > 1)
                     label = textwrap.fill(f"{method}, {setting} ({len(reports)})", 60)
-                    (line,) = ax.plot(mean, label=label)
+                    (line,) = ax.plot(mean, "-" if shared else "--", label=label)
                     ax.fill_between(range(len(mean)), mean - spread, mean + spread, color=line.get_color(), alpha=0.2)
             ax.set(xlabel="step", ylabel=title, ylim=(-0.3, 1.05))
             ax.grid(alpha=0.3)
-        axes[0].axhline(next(iter(rows.values()))[0]["cue_chance"], color="grey", linestyle="--", label="chance")
+        axes[0].axhline(next(iter(rows.values()))[0]["cue_chance"], color="grey", linestyle=":", label="chance")
         axes[0].set_title(task)
         part.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", frameon=False)
     figure.savefig(path, dpi=110)
@@ -267,7 +271,8 @@ def small_report(runs: dict, beliefs: dict, output: Path) -> None:
     lines += ["", "![success_once](small.png)", ""]
     if beliefs:
         belief_figure(beliefs, output / "belief.png")
-        shown = "The figure shows of each task the setting that most beliefs share; in brackets: seeds."
+        shown = "The figure shows of each task the setting that most beliefs share and, dashed, the flow belief of any "
+        shown += "setting that knows most of u at the last step; in brackets: seeds."
         lines += ["# What the beliefs remember of held-out episodes", "", shown, ""]
         lines += ["![cue and u from the mean particle](belief.png)"]
         lines += ["\n" + belief_table(task, rows) for task, rows in beliefs.items()]
