@@ -102,6 +102,8 @@ class Args:
     """layers of the GRU"""
     history_joints: bool = True
     """joints in the history, as in the paper; its authors' code has the image alone"""
+    image_shift: int = 0
+    """shift each episode's images by up to so many pixels while the belief is trained, against learning by heart"""
     belief_amp: bool = BFLOAT16
     """image network in bfloat16 while the belief is trained"""
     held_out_every: int = 50
@@ -318,6 +320,13 @@ class Episodes:
         return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
 
 
+def shift_images(rgb: torch.Tensor, pixels: int, rng: np.random.Generator) -> None:
+    """Roll each episode's images rgb (T, B, H, W, 3) in place by up to so many pixels (DrQ shifts image by image)."""
+    shifts = rng.integers(-pixels, pixels, (rgb.shape[1], 2), endpoint=True)
+    for images, shift in zip(rgb.unbind(1), shifts.tolist(), strict=True):
+        images.copy_(images.roll(shift, (1, 2)))
+
+
 def load_episodes(args: Args) -> tuple[Episodes, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
@@ -463,6 +472,7 @@ def main(args: Args) -> None:
     for update in bar:
         rng = np.random.default_rng([args.seed, update])
         batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
+        shift_images(batch["rgb"], args.image_shift, rng)
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
         losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
@@ -517,7 +527,7 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) else 1
-        least = {"seed": 0, "mesh_triangles": 0, "init_std": 0.001}.get(name, least)
+        least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:

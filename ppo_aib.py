@@ -656,7 +656,7 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
     for name, value in asdict(args).items():
         least = 0 if isinstance(value, bool | float) else 1
-        least = {"seed": 0, "mesh_triangles": 0, "init_std": 0.001}.get(name, least)
+        least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:

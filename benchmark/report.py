@@ -39,7 +39,14 @@ BELIEFS = {  # action_head in args.json, which Believer has not
     "none": "AIB, no action head",
     None: "Believer",
 }
-BELIEF_DEFAULTS = {"fm_latent": "mean", "history_joints": True, "action_lambda": 1.0, "image_norm": "mean", "beta": 1.0}
+BELIEF_DEFAULTS = {
+    "fm_latent": "mean",
+    "history_joints": True,
+    "action_lambda": 1.0,
+    "image_norm": "mean",
+    "beta": 1.0,
+    "image_shift": 0,
+}
 BELIEF_COLUMNS = {  # of diagnostics.json
     "cue from h": "cue_from_h",
     "cue from the mean particle": "cue_from_particle",

@@ -276,6 +276,20 @@ def test_chunks_of_frames_give_the_same_gradients(monkeypatch: pytest.MonkeyPatc
     assert all(torch.allclose(one, other, rtol=1e-4, atol=1e-6) for one, other in zip(*gradients, strict=True))
 
 
+def test_images_of_an_episode_are_shifted_alike_and_each_episodes_differently() -> None:
+    rgb = torch.randint(0, 256, (T, 40, *IMAGE), dtype=torch.uint8)
+    shifted, untouched = rgb.clone(), rgb.clone()
+    aib_belief.shift_images(shifted, 2, np.random.default_rng(0))
+    aib_belief.shift_images(untouched, 0, np.random.default_rng(0))
+    assert torch.equal(untouched, rgb)
+    pairs = [(y, x) for y in range(-2, 3) for x in range(-2, 3)]
+    fits = [
+        [torch.equal(new, old.roll(pair, (1, 2))) for pair in pairs]
+        for old, new in zip(rgb.unbind(1), shifted.unbind(1), strict=True)
+    ]
+    assert all(sum(row) == 1 for row in fits) and sum(map(any, zip(*fits, strict=True))) > 15
+
+
 def test_joints_enter_the_history_standardised() -> None:
     history, batch = belief_model(config={**CONFIG, "joints_dim": 7})["belief"].history, belief_batch()
     plain = aib_belief.encode_history(history, batch)
