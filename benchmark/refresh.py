@@ -1,0 +1,135 @@
+"""Does a belief still know u when its agent acts? And if not: a dataset with that agent's episodes in it.
+
+A belief is trained on episodes of the random policy. Once PPO has sent the arm elsewhere it may lose what it knew. This
+plays every second episode of stage 1's dataset anew with a trained agent, says how well its belief knew u there, and
+writes both kinds as a run of stage 1 with the same phi, on which stage 2 trains a refreshed belief.
+
+Usage:   python benchmark/refresh.py --agent runs/RememberColor5-v0__ppo_aib_small__1/agent.pt
+         python aib_belief.py --env-id RememberColor5-v0 --small --num-episodes 2000 --beta 10 --num-updates 1200 \
+             --repr-dir 'runs/{env_id}__aib_repr_refreshed__{seed}' --exp-name aib_belief_refreshed
+         python ppo_aib.py --env-id RememberColor5-v0 --small --num-episodes 2000 \
+             --belief 'runs/{env_id}__aib_belief_refreshed__{seed}/belief.pt' --exp-name ppo_aib_refreshed
+         (Believer: ppo_believer.py with --repr-dir and another --exp-name)
+Reads:   agent.pt of ppo_aib.py or ppo_believer.py; stage 1's dataset/ and repr.pt
+Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt
+"""
+
+import math
+import os
+import shutil
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+import ppo_aib  # noqa: E402
+import ppo_believer  # noqa: E402
+from aib_belief import StateEncoder  # noqa: E402
+from ppo_aib import BeliefAgent, fail, load  # noqa: E402
+
+
+@dataclass
+class Args:
+    agent: str
+    """agent.pt of ppo_aib.py or ppo_believer.py"""
+    repr_dir: str = "runs/{env_id}__aib_repr_small__{seed}"
+    """stage 1's run directory, on which the agent's belief was trained"""
+    exp_name: str = "aib_repr_refreshed"
+    """results go to runs/{env_id}__{exp_name}__{seed}"""
+    num_workers: int = ppo_aib.Args.num_workers
+    """simulator processes on physx_cpu"""
+
+
+@torch.no_grad()
+def play(
+    envs: gym.vector.VectorEnv, agent: BeliefAgent, settings: ppo_aib.Args, seeds: np.ndarray
+) -> dict[str, torch.Tensor]:
+    """One episode per seed (E,), E at most envs.num_envs, with actions drawn from the policy; what stage 1 keeps of it.
+
+    rgb, joints, state (E, T+1, ...); actions, rewards, success (E, T, ...); cue (E, K); mean particle (E, T+1, u).
+    """
+    device, config, count = agent.log_std.device, agent.belief.config, envs.num_envs
+    obs, info = envs.reset(seed=np.resize(seeds, count).tolist())
+    cue, memory, played = info["cue"], None, defaultdict(list)
+    for t in range((steps := gym.spec(settings.env_id).max_episode_steps) + 1):
+        step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
+        noise = [torch.randn(count, settings.num_particles, config[name], device=device) for name in ("z_dim", "u_dim")]
+        step["particles"], memory = agent.draw_particles(step, memory, *noise)
+        seen = {"rgb": obs["rgb"], "joints": obs["joints"], "state": info["state"]}
+        seen["particle"] = step["particles"].mean(-2)
+        if t < steps:
+            seen["actions"] = agent(step)[0].sample().clamp(-1, 1)
+            obs, seen["rewards"], _, _, info = envs.step(seen["actions"].cpu().numpy())
+            seen["success"] = info["success"]
+        for name, x in seen.items():
+            played[name].append(torch.as_tensor(np.array(x)) if isinstance(x, np.ndarray) else x.cpu())
+    episodes = {name: torch.stack(xs, 1) for name, xs in played.items()} | {"cue": torch.as_tensor(cue).cpu()}
+    return {name: x[: len(seeds)] for name, x in episodes.items()}
+
+
+def main(args: Args) -> None:
+    """Play, report, write the mixed dataset whole or not at all."""
+    hint = "name an agent.pt of ppo_aib.py or ppo_believer.py with --agent"
+    stored = load(Path(args.agent), hint)
+    beliefs = {"ppo_aib agent": ppo_aib.AIBBelief, "ppo_believer agent": ppo_believer.BelieverBelief}
+    if stored.get("kind") not in beliefs:
+        fail(f"{args.agent} is a file of another kind ({stored.get('kind')}); {hint}")
+    settings = ppo_aib.Args(num_workers=args.num_workers)  # devices of this machine, the rest as the agent was trained
+    for name in ("env_id", "seed", "robot", "mesh_triangles", "num_envs", "init_std", "amp", "num_particles"):
+        setattr(settings, name, stored[name])
+    source = Path(args.repr_dir.format(**vars(settings)))
+    task = {name: stored[name] for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
+    encoder = load(source / "repr.pt", "name its run of aib_repr.py with --repr-dir", kind="repr", **task)
+    path = Path("runs") / f"{settings.env_id}__{args.exp_name}__{settings.seed}"
+    if path.exists():
+        fail(f"{path} exists; choose another --exp-name")
+    ppo_aib.check_task(settings)
+
+    envs, device = ppo_aib.make_envs(settings), torch.device(settings.device)
+    (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
+    belief = beliefs[stored["kind"]](stored["config"], settings.amp)
+    agent = BeliefAgent(belief, joints_dim, action_dim, settings.init_std, settings.amp).to(device)
+    agent.load_state_dict(stored["agent"])
+    phi = StateEncoder(len(encoder["phi"]["mean"]), encoder["u_dim"])
+    phi.load_state_dict(encoder["phi"])
+
+    part = path.with_name(path.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    shutil.copytree(source / "dataset", part / "dataset")
+    shutil.copy(source / "repr.pt", part)
+    arrays = {file.stem: np.load(file, mmap_mode="r+") for file in (part / "dataset").glob("*.npy")}
+    torch.manual_seed(settings.seed)
+    anew, u, particle, success = np.arange(1, stored["num_episodes"], 2), [], [], []
+    bar = tqdm(total=len(anew), desc="the agent's episodes", unit="episode")
+    for now in np.array_split(anew, math.ceil(len(anew) / envs.num_envs)):
+        seeds = (settings.seed * 1_000_000 + now) % 2**29 + 2**30  # as in aib_repr.collect: the same scenes
+        episodes = play(envs, agent, settings, seeds)
+        for name, x in arrays.items():
+            x[now] = episodes[name]
+        u.append(phi(episodes["state"]).mean.detach())
+        particle.append(episodes["particle"])
+        success.append(episodes["success"].amax(1))
+        bar.update(len(now))
+    bar.close()
+    envs.close()
+    os.replace(part, path)
+    u, particle = torch.cat(u), torch.cat(particle)
+    r2 = 1 - (u - particle).square().sum((0, 2)) / (u - u.mean(0)).square().sum((0, 2))
+    known = " / ".join(f"{r2[t]:.2f}" for t in (4, 9, 30, -1))
+    print(f"{len(anew)} episodes of the agent, success_once {torch.cat(success).mean():.2f}")
+    print(f"R2 of u, mean particle, steps 4 / 9 / 30 / last: {known} (random policy: diagnostics.json of the belief)")
+    print(f"{path} is finished")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args))
+    except KeyboardInterrupt:
+        sys.exit("\nstopped; the same command starts anew")
