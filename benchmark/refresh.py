@@ -1,13 +1,14 @@
 """Does a belief still know u when its agent acts? And if not: a dataset with that agent's episodes in it.
 
 A belief is trained on episodes of the random policy. Once PPO has sent the arm elsewhere it may lose what it knew. This
-plays every second episode of stage 1's dataset anew with a trained agent, says how well its belief knew u there, and
-writes both kinds as a run of stage 1 with the same phi, on which stage 2 trains a refreshed belief.
+plays every second scene of stage 1's dataset once more with a trained agent, says how well its belief knew u there, and
+writes all episodes as a run of stage 1 with the same phi, on which stage 2 trains a refreshed belief. Half as many
+episodes come on top, so the stages after it need --num-episodes 3000 instead of 2000.
 
 Usage:   python benchmark/refresh.py --agent runs/RememberColor5-v0__ppo_aib_small__1/agent.pt
-         python aib_belief.py --env-id RememberColor5-v0 --small --num-episodes 2000 --beta 10 --num-updates 1200 \
+         python aib_belief.py --env-id RememberColor5-v0 --small --num-episodes 3000 --beta 10 --num-updates 1800 \
              --repr-dir 'runs/{env_id}__aib_repr_refreshed__{seed}' --exp-name aib_belief_refreshed
-         python ppo_aib.py --env-id RememberColor5-v0 --small --num-episodes 2000 \
+         python ppo_aib.py --env-id RememberColor5-v0 --small --num-episodes 3000 \
              --belief 'runs/{env_id}__aib_belief_refreshed__{seed}/belief.pt' --exp-name ppo_aib_refreshed
          (Believer: ppo_believer.py with --repr-dir and another --exp-name)
 Reads:   agent.pt of ppo_aib.py or ppo_believer.py; stage 1's dataset/ and repr.pt
@@ -85,12 +86,17 @@ def main(args: Args) -> None:
     for name in ("env_id", "seed", "robot", "mesh_triangles", "num_envs", "init_std", "amp", "num_particles"):
         setattr(settings, name, stored[name])
     source = Path(args.repr_dir.format(**vars(settings)))
-    task = {name: stored[name] for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
+    task = {name: stored[name] for name in ("env_id", "robot", "mesh_triangles")}
     encoder = load(source / "repr.pt", "name its run of aib_repr.py with --repr-dir", kind="repr", **task)
+    if "refreshed_by" in encoder:
+        fail(f"{source} is a refreshed dataset; name the run of aib_repr.py that it was made from with --repr-dir")
     path = Path("runs") / f"{settings.env_id}__{args.exp_name}__{settings.seed}"
     if path.exists():
         fail(f"{path} exists; choose another --exp-name")
     ppo_aib.check_task(settings)
+    files = list((source / "dataset").glob("*.npy"))
+    if (size := sum(file.stat().st_size for file in files) * 1.5) > shutil.disk_usage(source).free:
+        fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free")
 
     envs, device = ppo_aib.make_envs(settings), torch.device(settings.device)
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
@@ -100,16 +106,24 @@ def main(args: Args) -> None:
     phi = StateEncoder(len(encoder["phi"]["mean"]), encoder["u_dim"])
     phi.load_state_dict(encoder["phi"])
 
-    part = path.with_name(path.name + ".part")
+    count, part = encoder["num_episodes"], path.with_name(path.name + ".part")
+    scenes = np.sort(np.concatenate([np.arange(count), np.arange(1, count, 2)]))  # held-out scenes stay last
+    by_agent = np.diff(scenes, prepend=-1) == 0  # a scene's second episode
+    rows = np.flatnonzero(by_agent)
+    encoder |= {"num_episodes": len(scenes), "num_val": int((scenes >= count - encoder["num_val"]).sum())}
     shutil.rmtree(part, ignore_errors=True)
-    shutil.copytree(source / "dataset", part / "dataset")
-    shutil.copy(source / "repr.pt", part)
-    arrays = {file.stem: np.load(file, mmap_mode="r+") for file in (part / "dataset").glob("*.npy")}
+    (part / "dataset").mkdir(parents=True)
+    arrays = {}
+    for file in files:
+        random = np.load(file, mmap_mode="r")
+        shape = (len(scenes), *random.shape[1:])
+        arrays[file.stem] = np.lib.format.open_memmap(part / "dataset" / file.name, "w+", random.dtype, shape)
+        arrays[file.stem][~by_agent] = random
+    u, particle, success = [], [], []
     torch.manual_seed(settings.seed)
-    anew, u, particle, success = np.arange(1, stored["num_episodes"], 2), [], [], []
-    bar = tqdm(total=len(anew), desc="the agent's episodes", unit="episode")
-    for now in np.array_split(anew, math.ceil(len(anew) / envs.num_envs)):
-        seeds = (settings.seed * 1_000_000 + now) % 2**29 + 2**30  # as in aib_repr.collect: the same scenes
+    bar = tqdm(total=len(rows), desc="the agent's episodes", unit="episode")
+    for now in np.array_split(rows, math.ceil(len(rows) / envs.num_envs)):
+        seeds = (settings.seed * 1_000_000 + scenes[now]) % 2**29 + 2**30  # as in aib_repr.collect
         episodes = play(envs, agent, settings, seeds)
         for name, x in arrays.items():
             x[now] = episodes[name]
@@ -119,12 +133,13 @@ def main(args: Args) -> None:
         bar.update(len(now))
     bar.close()
     envs.close()
+    torch.save(encoder | {"refreshed_by": args.agent}, part / "repr.pt")
     os.replace(part, path)
-    held_out = anew >= stored["num_episodes"] - encoder["num_val"]  # the belief has learnt the other scenes
+    held_out = rows >= len(scenes) - encoder["num_val"]  # the belief has learnt the other scenes
     u, particle = torch.cat(u)[held_out], torch.cat(particle)[held_out]
     r2 = 1 - (u - particle).square().sum((0, 2)) / (u - u.mean(0)).square().sum((0, 2))
     known = " / ".join(f"{r2[t]:.2f}" for t in (4, 9, 30, -1))
-    print(f"{len(anew)} episodes of the agent, success_once {torch.cat(success).mean():.2f}")
+    print(f"{len(rows)} episodes of the agent, success_once {torch.cat(success).mean():.2f}")
     print(f"R2 of u, mean particle, held-out scenes, steps 4 / 9 / 30 / last: {known}")
     print("the same when the policy is random: u_r2_prior in diagnostics.json of the belief")
     print(f"{path} is finished")

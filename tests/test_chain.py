@@ -94,37 +94,40 @@ def test_evaluate_alone_repeats_the_last_evaluation(quick_runs: Path) -> None:
 
 
 def refresh(quick_runs: Path, script: str) -> tuple[int, str, str]:
-    """Let a script's agent play every second episode of the quick dataset: exit code, stdout, stderr."""
+    """Let a script's agent play every second scene of the quick dataset: exit code, stdout, stderr."""
     options = ["--agent", f"runs/{TASK}__{script}_quick__1/agent.pt", "--exp-name", f"refreshed_{script}"]
     options += ["--repr-dir", "runs/{env_id}__aib_repr_quick__{seed}"]
     return run("benchmark/refresh", *options, cwd=quick_runs.parent)
 
 
-def test_refresh_plays_every_second_episode_with_the_agent(quick_runs: Path) -> None:
+def test_refresh_adds_episodes_of_the_agent(quick_runs: Path) -> None:
     """The same scenes, other actions, the same phi; stage 2 trains on it, and nothing that exists is overwritten."""
     code, out, err = refresh(quick_runs, "ppo_aib")
     assert code == 0 and "4 episodes of the agent" in out, err
     paths = [quick_runs / f"{TASK}__{name}__1" for name in ("aib_repr_quick", "refreshed_ppo_aib")]
-    assert (paths[0] / "repr.pt").read_bytes() == (paths[1] / "repr.pt").read_bytes()
+    stored = [torch.load(path / "repr.pt", weights_only=True) for path in paths]
+    assert [(x["num_episodes"], x["num_val"]) for x in stored] == [(8, 4), (12, 6)]
+    assert all(torch.equal(x, y) for x, y in zip(stored[0]["phi"].values(), stored[1]["phi"].values(), strict=True))
     before, after = ({file.stem: np.load(file) for file in (path / "dataset").glob("*.npy")} for path in paths)
     assert before.keys() == after.keys()
+    by_random, by_agent = [0, 1, 3, 4, 6, 7, 9, 10], [2, 5, 8, 11]
     for name, x in before.items():
-        assert x.dtype == after[name].dtype and np.array_equal(x[::2], after[name][::2])
-    assert np.allclose(before["state"][:, 0], after["state"][:, 0], atol=1e-5), "the same scenes"
-    assert np.array_equal(before["cue"], after["cue"])
+        assert x.dtype == after[name].dtype and np.array_equal(x, after[name][by_random])
+    assert np.allclose(before["state"][1::2, 0], after["state"][by_agent, 0], atol=1e-5), "the same scenes"
+    assert np.array_equal(before["cue"][1::2], after["cue"][by_agent])
     env = aib_repr.make_task(aib_repr.Args(env_id=TASK), 1)
     env.reset(seed=1_000_003 % 2**29 + 2**30)
-    for t, action in enumerate(after["actions"][3, :20]):
+    for t, action in enumerate(after["actions"][5, :20]):
         assert not np.array_equal(action, before["actions"][3, t])
         obs, reward, _, _, info = env.step(action)
-        assert np.allclose(after["joints"][3, t + 1], obs["joints"], atol=1e-5), "what the action led to comes after it"
-        assert np.allclose(after["state"][3, t + 1], info["state"], atol=1e-5)
-        assert np.isclose(after["rewards"][3, t], reward, atol=1e-5)
+        assert np.allclose(after["joints"][5, t + 1], obs["joints"], atol=1e-5), "what the action led to comes after it"
+        assert np.allclose(after["state"][5, t + 1], info["state"], atol=1e-5)
+        assert np.isclose(after["rewards"][5, t], reward, atol=1e-5)
     env.close()
     again, _, err = refresh(quick_runs, "ppo_aib")
     assert again == 2 and "exists; choose another --exp-name" in err
     stage = ["--quick", "--repr-dir", "runs/{env_id}__refreshed_ppo_aib__{seed}", "--exp-name", "refreshed"]
-    code, _, err = run("aib_belief", "--env-id", TASK, *stage, cwd=quick_runs.parent)
+    code, _, err = run("aib_belief", "--env-id", TASK, "--num-episodes", "12", *stage, cwd=quick_runs.parent)
     assert code == 0, err
 
 
