@@ -142,7 +142,7 @@ def main(args: Args) -> None:
     print(f"{len(rows)} episodes of the agent, success_once {torch.cat(success).mean():.2f}")
     print(f"R2 of u, mean particle, held-out scenes, steps 4 / 9 / 30 / last: {known}")
     print("the same when the policy is random: u_r2_prior in diagnostics.json of the belief")
-    print(f"{path} is finished")
+    print(f"{path} is finished; the stages after it need --num-episodes {len(scenes)}")
 
 
 if __name__ == "__main__":

@@ -93,18 +93,18 @@ def test_evaluate_alone_repeats_the_last_evaluation(quick_runs: Path) -> None:
         assert metrics[name] == pytest.approx(float(last[name]), rel=1e-4)
 
 
-def refresh(quick_runs: Path, script: str) -> tuple[int, str, str]:
+def refresh(quick_runs: Path, script: str, source: str = "aib_repr_quick") -> tuple[int, str, str]:
     """Let a script's agent play every second scene of the quick dataset: exit code, stdout, stderr."""
-    options = ["--agent", f"runs/{TASK}__{script}_quick__1/agent.pt", "--exp-name", f"refreshed_{script}"]
-    options += ["--repr-dir", "runs/{env_id}__aib_repr_quick__{seed}"]
+    options = ["--agent", f"runs/{TASK}__{script}_quick__1/agent.pt", "--exp-name", f"{source}_and_{script}"]
+    options += ["--repr-dir", f"runs/{{env_id}}__{source}__{{seed}}"]
     return run("benchmark/refresh", *options, cwd=quick_runs.parent)
 
 
 def test_refresh_adds_episodes_of_the_agent(quick_runs: Path) -> None:
     """The same scenes, other actions, the same phi; stage 2 trains on it, and nothing that exists is overwritten."""
     code, out, err = refresh(quick_runs, "ppo_aib")
-    assert code == 0 and "4 episodes of the agent" in out, err
-    paths = [quick_runs / f"{TASK}__{name}__1" for name in ("aib_repr_quick", "refreshed_ppo_aib")]
+    assert code == 0 and "4 episodes of the agent" in out and "need --num-episodes 12" in out, err
+    paths = [quick_runs / f"{TASK}__{name}__1" for name in ("aib_repr_quick", "aib_repr_quick_and_ppo_aib")]
     stored = [torch.load(path / "repr.pt", weights_only=True) for path in paths]
     assert [(x["num_episodes"], x["num_val"]) for x in stored] == [(8, 4), (12, 6)]
     assert all(torch.equal(x, y) for x, y in zip(stored[0]["phi"].values(), stored[1]["phi"].values(), strict=True))
@@ -126,7 +126,9 @@ def test_refresh_adds_episodes_of_the_agent(quick_runs: Path) -> None:
     env.close()
     again, _, err = refresh(quick_runs, "ppo_aib")
     assert again == 2 and "exists; choose another --exp-name" in err
-    stage = ["--quick", "--repr-dir", "runs/{env_id}__refreshed_ppo_aib__{seed}", "--exp-name", "refreshed"]
+    twice, _, err = refresh(quick_runs, "ppo_aib", source="aib_repr_quick_and_ppo_aib")
+    assert twice == 2 and "is a refreshed dataset" in err
+    stage = ["--quick", "--repr-dir", "runs/{env_id}__aib_repr_quick_and_ppo_aib__{seed}", "--exp-name", "refreshed"]
     code, _, err = run("aib_belief", "--env-id", TASK, "--num-episodes", "12", *stage, cwd=quick_runs.parent)
     assert code == 0, err
 
