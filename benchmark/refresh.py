@@ -9,8 +9,8 @@ Usage:   python benchmark/refresh.py --agent runs/RememberColor5-v0__ppo_aib_sma
          python aib_belief.py --env-id RememberColor5-v0 --small --num-episodes 3000 --beta 10 --num-updates 1800 \
              --repr-dir 'runs/{env_id}__aib_repr_refreshed__{seed}' --exp-name aib_belief_refreshed
          python ppo_aib.py --env-id RememberColor5-v0 --small --num-episodes 3000 \
-             --belief 'runs/{env_id}__aib_belief_refreshed__{seed}/belief.pt' --exp-name ppo_aib_refreshed
-         (Believer: ppo_believer.py with --repr-dir and another --exp-name)
+             --belief 'runs/{env_id}__aib_belief_refreshed__{seed}/belief.pt' --exp-name ppo_aib_refreshed_small
+         (Believer: ppo_believer.py with --repr-dir and --exp-name ppo_believer_refreshed_small)
 Reads:   agent.pt of ppo_aib.py or ppo_believer.py; stage 1's dataset/ and repr.pt
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt
 """

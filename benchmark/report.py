@@ -271,8 +271,14 @@ def small_report(runs: dict, beliefs: dict, output: Path) -> None:
             cells = [cell(runs.get((task, f"{name}_small")), column, which) for name in METHODS]
             measure = f"{column}, {'mean of the last three' if which == 'last' else 'maximum'}"
             lines.append(f"| {task} | {measure} | " + " | ".join(cells) + " |")
-        for method, label in METHODS.items():
+        refreshed = [runs.get((task, f"{name}_refreshed_small")) for name in METHODS]
+        if any(refreshed):
+            cells = [cell(found, "success_once", "last") if found else "–" for found in refreshed]
+            lines.append(f"| {task} | the first of these, belief refreshed (refresh.py) | " + " | ".join(cells) + " |")
+        for (method, label), found in zip(METHODS.items(), refreshed, strict=True):
             draw(ax, runs.get((task, f"{method}_small")), "success_once", label, COLOURS[method])
+            if found:
+                draw(ax, found, "success_once", f"{label}, belief refreshed", COLOURS[method], "--")
         ax.set_title(task)
     finish(figure, axes[0], "success_once", output / "small.png")
     lines += ["", "![success_once](small.png)", ""]
@@ -296,7 +302,7 @@ def variant_table(runs: dict, title: str, variants: dict[str, str], paper: dict[
     return "\n".join(lines)
 
 
-def draw(axes: plt.Axes, runs: list[Run] | None, column: str, label: str, colour: str | None) -> None:
+def draw(axes: plt.Axes, runs: list[Run] | None, column: str, label: str, colour: str | None, style: str = "-") -> None:
     """One learning curve: mean over seeds at the steps all of them have, shaded by the standard deviation."""
     runs = [run for run in runs or [] if not run.quick]
     if not runs:
@@ -307,7 +313,7 @@ def draw(axes: plt.Axes, runs: list[Run] | None, column: str, label: str, colour
     values = np.stack([run.columns[column][:length] for run in runs])
     seeds = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"
     unfinished = "" if all(run.finished for run in runs) else ", unfinished"
-    (line,) = axes.plot(steps, values.mean(0), color=colour, label=f"{label} ({seeds}{unfinished})")
+    (line,) = axes.plot(steps, values.mean(0), style, color=colour, label=f"{label} ({seeds}{unfinished})")
     if len(runs) > 1:
         spread = values.std(0, ddof=1)
         axes.fill_between(steps, values.mean(0) - spread, values.mean(0) + spread, color=line.get_color(), alpha=0.2)

@@ -44,11 +44,11 @@ def test_tables_against_numbers_computed_by_hand(tmp_path: Path) -> None:
 
 
 def test_small_runs_of_any_task(tmp_path: Path) -> None:
-    for seed in (1, 2, 3):
-        run = tmp_path / f"X-v0__ppo_aib_small__{seed}"
+    for seed, name in ((1, "ppo_aib"), (2, "ppo_aib"), (3, "ppo_aib"), (1, "ppo_aib_refreshed")):
+        run = tmp_path / f"X-v0__{name}_small__{seed}"
         shutil.copytree(RECORDED / f"RememberShapeAndColor3x2-v0__ppo_aib__{seed}", run)
         args = json.loads((run / "args.json").read_text())
-        (run / "args.json").write_text(json.dumps({**args, "env_id": "X-v0", "exp_name": "ppo_aib_small"}))
+        (run / "args.json").write_text(json.dumps({**args, "env_id": "X-v0", "exp_name": f"{name}_small"}))
     for seed, cue in ((1, 0.5), (2, 0.7)):
         run = tmp_path / f"X-v0__aib_belief_small__{seed}"
         run.mkdir()
@@ -65,6 +65,7 @@ def test_small_runs_of_any_task(tmp_path: Path) -> None:
         f"| X-v0 | success_once, mean of the last three | {values} | missing | missing |" in text
         and iio.imread(tmp_path / "small.png").std() > 10
     )
+    assert "| X-v0 | the first of these, belief refreshed (refresh.py) | 0.60 (1 seed) | – | – |" in text
     by_step = "0.00 ± 0.00 / 0.00 ± 0.00 / 0.00 ± 0.00 / 0.60 ± 0.14"
     row = ["AIB, MSE regression, 9 episodes, 1,000 updates, wet", "2", *[by_step] * 3, *["1.20 ± 0.28"] * 3, "–", "–"]
     assert "| " + " | ".join(row) + " |" in text
