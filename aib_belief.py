@@ -35,7 +35,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
@@ -503,9 +503,7 @@ def main(args: Args) -> None:
         report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
     writer.close()
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
-    some = fit["particle"][:, ::8]  # every 8th step is enough
-    readout_data = {"particle": some.flatten(0, 1), "cue": fit["cue"].repeat_interleave(some.shape[1], 0)}
-    content = {"kind": "aib_belief", **asdict(args), "config": config, "readout_data": readout_data}
+    content = {"kind": "aib_belief", **asdict(args), "config": config, "phi": stored["phi"]}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
     known = [f"{name} {report[name][-1]:.2f}" for name in ("cue_from_u", "cue_from_particle", "u_r2_prior")]
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: {', '.join(known)}")
@@ -530,6 +528,9 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
         least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
+        most = {"gamma": 1, "gae_lambda": 1, "noise_beta": 2}.get(name, math.inf)
+        if isinstance(value, int | float) and value > most:
+            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at most {most}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     return args

@@ -24,6 +24,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
 
+import colorednoise
 import gymnasium as gym
 import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
 import numpy as np
@@ -38,7 +39,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -78,6 +79,8 @@ class Args:
     """at most so many scenes at a time; physx_cuda draws one arm pose for all of them"""
     num_episodes: int = 2000
     """episodes of the random policy; 640 are enough for RememberColor3-v0, not for harder tasks"""
+    noise_beta: float = 0.0
+    """exponent of the random actions' spectrum 1/f**beta: 0 is white; with more the arm gets farther"""
     val_share: float = 0.1
     """share of the episodes held out"""
     epochs: int = 200
@@ -222,6 +225,19 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args
 # ---------------------------------------------------------------- data
 
 
+def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Gaussian noise of shape (..., T), N(0, 1) at every step, spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
+    power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
+    return noise * np.sqrt(power[1:].sum() / power.sum())  # the package's std is 1 without the constant term
+
+
+def random_actions(args: Args, episode: int, steps: int, action_dim: int) -> np.ndarray:
+    """Actions (T, A) of an episode, uniform in [-1, 1] at every step: the normal CDF of colored_noise."""
+    noise = colored_noise(args.noise_beta, (action_dim, steps), np.random.default_rng([args.seed, episode]))
+    return (2 * torch.special.ndtr(torch.from_numpy(noise.T)) - 1).float().numpy()
+
+
 def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
     """Fill dataset/ from where it stopped with N whole episodes of the uniformly random policy; its memory maps:
 
@@ -240,8 +256,7 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
     bar = tqdm(total=count * steps, initial=meta["episodes_done"] * steps, desc="random policy", unit="step")
     for first in range(meta["episodes_done"], count, envs.num_envs):
         now = np.arange(first, min(first + envs.num_envs, count))  # the episodes of this round
-        rngs = [np.random.default_rng([args.seed, episode]) for episode in now]
-        actions = np.stack([rng.uniform(-1, 1, (steps, action_dim)) for rng in rngs]).astype(np.float32)
+        actions = np.stack([random_actions(args, episode, steps, action_dim) for episode in now])
         seeds = (args.seed * 1_000_000 + now) % 2**29 + 2**30  # above those of PPO's training, below its evaluation's
         obs, info = envs.reset(seed=np.resize(seeds, envs.num_envs).tolist())
         cue = info["cue"]  # at the start: in Rotate tasks it is what is left to turn
@@ -436,6 +451,24 @@ def lighten_meshes(task: gym.Env, triangles: int) -> None:
             entity.remove_component(old)
 
 
+def flatten_ground(task: gym.Env) -> None:
+    """Draw the ground as two triangles between its corners instead of ManiSkill's 20,000: the same picture."""
+    for entity in task.scene.actors["ground"]._objs:
+        grid = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        (part,) = grid.render_shapes[0].parts
+        edge = np.abs(part.vertices[:, :2] - part.vertices[:, :2].mean(0))
+        corners = (edge == edge.max(0)).all(1)  # in the order (-, -), (-, +), (+, -), (+, +)
+        vertices, normals, uvs = (
+            part.vertices[corners],
+            part.get_vertex_normal()[corners],
+            part.get_vertex_uv()[corners],
+        )
+        plane, triangles = sapien.render.RenderBodyComponent(), np.array([[0, 2, 3], [0, 3, 1]])
+        plane.attach(sapien.render.RenderShapeTriangleMesh(vertices, triangles, normals, uvs, part.material))
+        entity.remove_component(grid)
+        entity.add_component(plane)
+
+
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
@@ -446,6 +479,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
         if args.mesh_triangles:
             lighten_meshes(env.unwrapped, args.mesh_triangles)
+            flatten_ground(env.unwrapped)
         env = TaskView(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
@@ -507,6 +541,9 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
         least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
+        most = {"gamma": 1, "gae_lambda": 1, "noise_beta": 2}.get(name, math.inf)
+        if isinstance(value, int | float) and value > most:
+            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at most {most}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     return args

@@ -29,6 +29,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
 
+import colorednoise
 import gymnasium as gym
 import imageio.v3 as iio
 import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
@@ -40,12 +41,11 @@ import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
-from sklearn import linear_model, pipeline, preprocessing
 from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
@@ -120,6 +120,8 @@ class Args:
     """episodes per evaluation, the same every time"""
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
+    noise_beta: float = 0.0
+    """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, the paper's; 1 is pink"""
     amp: bool = False
     """image network in bfloat16"""
     evaluate: bool = False
@@ -184,6 +186,19 @@ class NatureCNN(nn.Module):
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         with torch.autocast(images.device.type, torch.bfloat16, enabled=self.amp):
             return self.out(self.conv(images.permute(0, 3, 1, 2))).float()
+
+
+class StateEncoder(nn.Module):
+    """phi: privileged state (..., D), standardised inside, -> Normal over u (..., u_dim) (paper 3.1)."""
+
+    def __init__(self, state_dim: int, u_dim: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(state_dim))
+        self.register_buffer("std", torch.ones(state_dim))
+        self.net = GaussianMLP(state_dim, [256, 256], u_dim, min_std=1e-5)
+
+    def forward(self, state: torch.Tensor) -> Normal:
+        return self.net((state - self.mean) / self.std)
 
 
 class HistoryEncoder(nn.Module):
@@ -305,19 +320,28 @@ def ppo_losses(agent: nn.Module, batch: dict[str, torch.Tensor], args: Args) -> 
 # ---------------------------------------------------------------- data
 
 
+def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Gaussian noise of shape (..., T), N(0, 1) at every step, spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
+    power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
+    return noise * np.sqrt(power[1:].sum() / power.sum())  # the package's std is 1 without the constant term
+
+
 @torch.no_grad()
 def rollout_with_belief(
     envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, seeds: np.ndarray, explore: bool = True
 ) -> dict[str, torch.Tensor]:
     """Play one whole episode per seed; without explore, actions are the policy's means.
 
-    Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
-    V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs; noise is drawn before: on physx_cpu their size is no matter.
+    Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success; and value (T+1, N),
+    V(o_T) last. Without explore also the privileged state, for u_r2 alone. The particles are kept because fresh ones
+    would change the probability ratio of the update. Episodes are played in rounds of envs.num_envs; noise is drawn
+    before: on physx_cpu their size is no matter.
     """
     steps, count, (action_dim,) = gym.spec(args.env_id).max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
-    noise = torch.randn(steps, count, action_dim, device=device) * explore
+    noise = colored_noise(args.noise_beta, (count, action_dim, steps), np.random.default_rng(seeds)) * explore
+    noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
     z_noise = torch.randn(steps + 1, count, n, config["z_dim"], device=device)
     u_noise = torch.randn(steps + 1, count, n, config["u_dim"], device=device) * args.particle_noise
     data = {"value": torch.empty(steps + 1, count, device=device)}
@@ -325,10 +349,12 @@ def rollout_with_belief(
     for first in range(0, count, envs.num_envs):
         now = slice(first, min(first + envs.num_envs, count))  # the episodes of this round
         playing = now.stop - now.start  # in the last round some environments may only repeat what others do
-        obs, initial = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
+        obs, info = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
         memory = None
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name][:playing], device=device) for name in ("rgb", "joints")}
+            if not explore:
+                step["state"] = torch.as_tensor(info["state"][:playing], device=device)
             step["particles"], memory = agent.draw_particles(step, memory, z_noise[t, now], u_noise[t, now])
             policy, data["value"][t, now] = agent(step)
             if t == steps:
@@ -337,7 +363,7 @@ def rollout_with_belief(
             step["logprob"] = policy.log_prob(step["action"]).sum(-1)
             action = step["action"].clamp(-1, 1).cpu().numpy()
             obs, reward, _, _, info = envs.step(np.resize(action, (envs.num_envs, action_dim)))
-            for name, x in (("reward", reward), ("success", info["success"]), ("cue", initial["cue"])):
+            for name, x in (("reward", reward), ("success", info["success"])):
                 step[name] = torch.as_tensor(x[:playing], dtype=torch.float32, device=device)
             for name, x in step.items():
                 if name not in data:
@@ -371,79 +397,81 @@ def make_video(data: dict[str, torch.Tensor]) -> bytes:
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1)
 
 
-def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
-
-    The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
-    """
-    varies = y.amax(0) > y.amin(0)
-    if not varies.any():
-        return math.nan
-    x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
-    classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
-    model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
-    model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
-    return float(np.mean([model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]))
+def r_squared(u: torch.Tensor, estimate: torch.Tensor) -> float:
+    """R2 of u (M, u_dim) from its estimate: 1 if that is u, 0 if it is no better than the mean of u."""
+    return 1 - ((u - estimate).square().sum() / (u - u.mean(0)).square().sum()).item()
 
 
+@torch.no_grad()
 def evaluate_with_belief(
-    envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, readout_data: dict[str, torch.Tensor]
+    envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, phi: StateEncoder
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    cue_readout: cue (M, K) from mean particle (M, u_dim), fitted on readout_data, random actions', and tested here.
+    u_r2, u_r2_at_end: what the belief knows where its agent takes it, R2 of u = phi(s) from the mean particle, over all
+    steps and at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
     """
     torch.manual_seed(0)
     data = rollout_with_belief(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), explore=False)
-    particle, cue = data["particles"].mean(-2).flatten(0, 1), data["cue"].flatten(0, 1)
-    cue_readout = readout_score(readout_data["particle"], readout_data["cue"], particle, cue)
-    return {**success_and_return(data), "cue_readout": cue_readout}, make_video(data)
+    u, estimate = phi(data["state"]).mean, data["particles"].mean(-2)
+    metrics = success_and_return(data)
+    metrics["u_r2"] = r_squared(u.flatten(0, 1), estimate.flatten(0, 1))
+    metrics["u_r2_at_end"] = r_squared(u[-1], estimate[-1])
+    return metrics, make_video(data)
 
 
 # ---------------------------------------------------------------- training
 
 
+def evaluate_checkpoint(args: Args) -> None:
+    """Evaluate the agent of --checkpoint, on the task it was trained on; writes evaluation.json and .mp4 beside it."""
+    file = Path(args.checkpoint.format(**vars(args)))
+    stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
+    for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
+        setattr(args, name, stored[name])
+    check_task(args)
+    envs, device = make_envs(args), torch.device(args.device)
+    (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
+    belief = AIBBelief(stored["config"], args.amp)
+    agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
+    phi = StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"]).to(device)
+    phi.load_state_dict(stored["phi"])
+    agent.load_state_dict(stored["agent"])
+    metrics, video = evaluate_with_belief(envs, agent, args, phi)
+    save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
+    save(file.with_name("evaluation.mp4"), video)
+    print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
+    envs.close()
+
+
 def main(args: Args) -> None:
-    """Train an agent that acts on observation and belief, or with --evaluate only evaluate one."""
-    if args.evaluate:
-        file = Path(args.checkpoint.format(**vars(args)))
-        stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
-        for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
-            setattr(args, name, stored[name])
+    """Train an agent that acts on observation and belief."""
     check_task(args)
     per_iteration = gym.spec(args.env_id).max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // per_iteration)
-    if not args.evaluate:
-        path = open_run(args)
-        resume = (path / "checkpoint.pt").exists()
-        checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
-        if checkpoint.get("iteration") == num_iterations:
-            print(f"{path} is finished; --overwrite makes it anew")
-            return
-        file, size = Path(args.belief.format(**vars(args))), QUICK if args.quick else SMALL if args.small else {}
-        if not file.exists() and args.belief == size.get("belief", Args.belief):
-            run_stage("aib_belief.py", args)
-        hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_belief.py --overwrite"
-        task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
-        stored = load(file, hint, kind="aib_belief", **task)
-        begun = checkpoint.get("agent", {})
-        if any(not torch.equal(begun.get(f"belief.{name}", x), x) for name, x in stored["belief"].items()):
-            fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
+    path = open_run(args)
+    resume = (path / "checkpoint.pt").exists()
+    checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
+    if checkpoint.get("iteration") == num_iterations:
+        print(f"{path} is finished; --overwrite makes it anew")
+        return
+    file, size = Path(args.belief.format(**vars(args))), QUICK if args.quick else SMALL if args.small else {}
+    if not file.exists() and args.belief == size.get("belief", Args.belief):
+        run_stage("aib_belief.py", args)
+    hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_belief.py --overwrite"
+    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
+    stored = load(file, hint, kind="aib_belief", **task)
+    begun = checkpoint.get("agent", {})
+    if any(not torch.equal(begun.get(f"belief.{name}", x), x) for name, x in stored["belief"].items()):
+        fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
 
     envs, device = make_envs(args), torch.device(args.device)
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     torch.manual_seed(args.seed)
     belief = AIBBelief(stored["config"], args.amp)
     agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
-    if args.evaluate:
-        agent.load_state_dict(stored["agent"])
-        metrics, video = evaluate_with_belief(envs, agent, args, stored["readout_data"])
-        save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
-        save(file.with_name("evaluation.mp4"), video)
-        print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
-        envs.close()
-        return
-
+    phi = StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"]).to(device)
+    phi.load_state_dict(stored["phi"])
     agent.belief.load_state_dict(stored["belief"])
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
@@ -481,14 +509,13 @@ def main(args: Args) -> None:
         del data, batch, losses  # a gigabyte of images and a graph: not two at a time
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
-            metrics, video = evaluate_with_belief(envs, agent, args, stored["readout_data"])
+            metrics, video = evaluate_with_belief(envs, agent, args, phi)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
-            metrics.pop("cue_readout")  # the columns of eval.csv are those of plain PPO
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
             lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"config": stored["config"], "readout_data": stored["readout_data"], "agent": agent.state_dict()}
+            content = {"config": stored["config"], "phi": stored["phi"], "agent": agent.state_dict()}
             content |= {"kind": "ppo_aib agent", "global_step": global_step}
             save(path / "agent.pt", {**asdict(args), **content})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
@@ -588,6 +615,24 @@ def lighten_meshes(task: gym.Env, triangles: int) -> None:
             entity.remove_component(old)
 
 
+def flatten_ground(task: gym.Env) -> None:
+    """Draw the ground as two triangles between its corners instead of ManiSkill's 20,000: the same picture."""
+    for entity in task.scene.actors["ground"]._objs:
+        grid = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        (part,) = grid.render_shapes[0].parts
+        edge = np.abs(part.vertices[:, :2] - part.vertices[:, :2].mean(0))
+        corners = (edge == edge.max(0)).all(1)  # in the order (-, -), (-, +), (+, -), (+, +)
+        vertices, normals, uvs = (
+            part.vertices[corners],
+            part.get_vertex_normal()[corners],
+            part.get_vertex_uv()[corners],
+        )
+        plane, triangles = sapien.render.RenderBodyComponent(), np.array([[0, 2, 3], [0, 3, 1]])
+        plane.attach(sapien.render.RenderShapeTriangleMesh(vertices, triangles, normals, uvs, part.material))
+        entity.remove_component(grid)
+        entity.add_component(plane)
+
+
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
@@ -598,6 +643,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
         if args.mesh_triangles:
             lighten_meshes(env.unwrapped, args.mesh_triangles)
+            flatten_ground(env.unwrapped)
         env = TaskView(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
@@ -659,6 +705,9 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
         least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
+        most = {"gamma": 1, "gae_lambda": 1, "noise_beta": 2}.get(name, math.inf)
+        if isinstance(value, int | float) and value > most:
+            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at most {most}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     return args
@@ -729,6 +778,10 @@ def run_stage(script: str, args: Args) -> None:
 
 if __name__ == "__main__":
     try:
-        main(parse_args(TASKS, SMALL, QUICK))
+        args = parse_args(TASKS, SMALL, QUICK)
+        if args.evaluate:
+            evaluate_checkpoint(args)
+        else:
+            main(args)
     except KeyboardInterrupt:
         sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")

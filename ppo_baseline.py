@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, NoReturn
 
+import colorednoise
 import gymnasium as gym
 import imageio.v3 as iio
 import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
@@ -36,7 +37,7 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
@@ -103,6 +104,8 @@ class Args:
     """episodes per evaluation, the same every time"""
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
+    noise_beta: float = 0.0
+    """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, the paper's; 1 is pink"""
     amp: bool = False
     """image network in bfloat16"""
     evaluate: bool = False
@@ -202,6 +205,13 @@ def ppo_losses(agent: nn.Module, batch: dict[str, torch.Tensor], args: Args) -> 
 # ---------------------------------------------------------------- data
 
 
+def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Gaussian noise of shape (..., T), N(0, 1) at every step, spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
+    power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
+    return noise * np.sqrt(power[1:].sum() / power.sum())  # the package's std is 1 without the constant term
+
+
 @torch.no_grad()
 def rollout(
     envs: gym.vector.VectorEnv, agent: Agent, args: Args, seeds: np.ndarray, explore: bool = True
@@ -213,7 +223,8 @@ def rollout(
     """
     steps, count, (action_dim,) = gym.spec(args.env_id).max_episode_steps, len(seeds), envs.single_action_space.shape
     device = torch.device(args.device)
-    noise = torch.randn(steps, count, action_dim, device=device) * explore
+    noise = colored_noise(args.noise_beta, (count, action_dim, steps), np.random.default_rng(seeds)) * explore
+    noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
     data = {"value": torch.empty(steps + 1, count, device=device)}
     bar = tqdm(total=steps * count, desc="rollout" if explore else "evaluation", unit="step", leave=False)
     for first in range(0, count, envs.num_envs):
@@ -273,37 +284,40 @@ def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args) -> tuple[dict
 # ---------------------------------------------------------------- training
 
 
+def evaluate_checkpoint(args: Args) -> None:
+    """Evaluate the agent of --checkpoint, on the task it was trained on; writes evaluation.json and .mp4 beside it."""
+    file = Path(args.checkpoint.format(**vars(args)))
+    stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_baseline agent")
+    for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp"):
+        setattr(args, name, stored[name])
+    check_task(args)
+    envs, device = make_envs(args), torch.device(args.device)
+    image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
+    agent = Agent(image_shape, joints_dim, envs.single_action_space.shape[0], args.init_std, args.amp).to(device)
+    agent.load_state_dict(stored["agent"])
+    metrics, video = evaluate(envs, agent, args)
+    save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
+    save(file.with_name("evaluation.mp4"), video)
+    print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
+    envs.close()
+
+
 def main(args: Args) -> None:
-    """Train an agent that acts on the present observation alone, or with --evaluate only evaluate one."""
-    if args.evaluate:
-        file = Path(args.checkpoint.format(**vars(args)))
-        stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_baseline agent")
-        for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp"):
-            setattr(args, name, stored[name])
+    """Train an agent that acts on the present observation alone."""
     check_task(args)
     per_iteration = gym.spec(args.env_id).max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // per_iteration)
-    if not args.evaluate:
-        path = open_run(args)
-        resume = (path / "checkpoint.pt").exists()
-        checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
-        if checkpoint.get("iteration") == num_iterations:
-            print(f"{path} is finished; --overwrite makes it anew")
-            return
+    path = open_run(args)
+    resume = (path / "checkpoint.pt").exists()
+    checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
+    if checkpoint.get("iteration") == num_iterations:
+        print(f"{path} is finished; --overwrite makes it anew")
+        return
 
     envs, device = make_envs(args), torch.device(args.device)
     image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
     torch.manual_seed(args.seed)
     agent = Agent(image_shape, joints_dim, envs.single_action_space.shape[0], args.init_std, args.amp).to(device)
-    if args.evaluate:
-        agent.load_state_dict(stored["agent"])
-        metrics, video = evaluate(envs, agent, args)
-        save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
-        save(file.with_name("evaluation.mp4"), video)
-        print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
-        envs.close()
-        return
-
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     if checkpoint:
@@ -445,6 +459,24 @@ def lighten_meshes(task: gym.Env, triangles: int) -> None:
             entity.remove_component(old)
 
 
+def flatten_ground(task: gym.Env) -> None:
+    """Draw the ground as two triangles between its corners instead of ManiSkill's 20,000: the same picture."""
+    for entity in task.scene.actors["ground"]._objs:
+        grid = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        (part,) = grid.render_shapes[0].parts
+        edge = np.abs(part.vertices[:, :2] - part.vertices[:, :2].mean(0))
+        corners = (edge == edge.max(0)).all(1)  # in the order (-, -), (-, +), (+, -), (+, +)
+        vertices, normals, uvs = (
+            part.vertices[corners],
+            part.get_vertex_normal()[corners],
+            part.get_vertex_uv()[corners],
+        )
+        plane, triangles = sapien.render.RenderBodyComponent(), np.array([[0, 2, 3], [0, 3, 1]])
+        plane.attach(sapien.render.RenderShapeTriangleMesh(vertices, triangles, normals, uvs, part.material))
+        entity.remove_component(grid)
+        entity.add_component(plane)
+
+
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
@@ -455,6 +487,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
         if args.mesh_triangles:
             lighten_meshes(env.unwrapped, args.mesh_triangles)
+            flatten_ground(env.unwrapped)
         env = TaskView(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
@@ -516,6 +549,9 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
         least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
+        most = {"gamma": 1, "gae_lambda": 1, "noise_beta": 2}.get(name, math.inf)
+        if isinstance(value, int | float) and value > most:
+            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at most {most}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     return args
@@ -570,6 +606,10 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 
 if __name__ == "__main__":
     try:
-        main(parse_args(TASKS, SMALL, QUICK))
+        args = parse_args(TASKS, SMALL, QUICK)
+        if args.evaluate:
+            evaluate_checkpoint(args)
+        else:
+            main(args)
     except KeyboardInterrupt:
         sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")

@@ -31,6 +31,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
 
+import colorednoise
 import gymnasium as gym
 import imageio.v3 as iio
 import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
@@ -43,12 +44,11 @@ import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
-from sklearn import linear_model, pipeline, preprocessing
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 4  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
@@ -151,6 +151,8 @@ class Args:
     """episodes per evaluation, the same every time"""
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
+    noise_beta: float = 0.0
+    """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, the paper's; 1 is pink"""
     amp: bool = False
     """image network in bfloat16"""
     evaluate: bool = False
@@ -281,11 +283,6 @@ class BelieverBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
 
-    def prior(self, h: torch.Tensor) -> Normal:
-        """N(0, I), whatever the history: h (..., 256) -> Normal (..., z_dim)."""
-        zeros = torch.zeros(*h.shape[:-1], self.config["z_dim"], device=h.device)
-        return Normal(zeros, torch.ones_like(zeros), validate_args=False)
-
     def decode(self, h: torch.Tensor, z_noise: torch.Tensor) -> Normal:
         """Give p(u|z_i,h) of z_i ~ N(0, I), i = 1..n: h (..., 256), noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
         return self.decoder(torch.cat([z_noise, h.unsqueeze(-2).expand(*z_noise.shape[:-1], -1)], -1))
@@ -350,19 +347,14 @@ def encode_history(history: nn.Module, batch: dict[str, torch.Tensor], bptt_step
     return torch.cat(outputs)
 
 
-def elbo_terms(belief: nn.Module, posterior: nn.Module, u: torch.Tensor, h: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Terms of -L_VAE at each step (...,): -log p(u|z,h) and KL(q || p); then z ~ q and the mean of q (..., z_dim)."""
-    q = posterior(torch.cat([u, h], -1))
-    z = q.rsample()
-    nll = -belief.decoder(torch.cat([z, h], -1)).log_prob(u).sum(-1)
-    return nll, kl_divergence(q, belief.prior(h)).sum(-1), z, q.mean
-
-
 def believer_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
     """-ELBO with the fixed prior and its terms, averaged over all steps of a batch of whole episodes."""
     h = encode_history(model["belief"].history, batch, args.bptt_steps)
-    nll, kl, _, _ = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
-    return {"nll": nll.mean(), "kl": kl.mean(), "total": nll.mean() + args.beta * kl.mean()}
+    q = model["posterior"](torch.cat([batch["u"], h], -1))
+    decoded = model["belief"].decoder(torch.cat([q.rsample(), h], -1))
+    nll = -decoded.log_prob(batch["u"]).sum(-1).mean()
+    kl = kl_divergence(q, Normal(0.0, 1.0)).sum(-1).mean()
+    return {"nll": nll, "kl": kl, "total": nll + args.beta * kl}
 
 
 def compute_gae(rewards: torch.Tensor, values: torch.Tensor, gamma: float, gae_lambda: float) -> torch.Tensor:
@@ -445,19 +437,28 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
         fail(f"{path / 'dataset'} is damaged or incomplete ({error}); {hint}")
 
 
+def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Gaussian noise of shape (..., T), N(0, 1) at every step, spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
+    power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
+    return noise * np.sqrt(power[1:].sum() / power.sum())  # the package's std is 1 without the constant term
+
+
 @torch.no_grad()
 def rollout_with_belief(
     envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, seeds: np.ndarray, explore: bool = True
 ) -> dict[str, torch.Tensor]:
     """Play one whole episode per seed; without explore, actions are the policy's means.
 
-    Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success, cue; and value (T+1, N),
-    V(o_T) last. The particles are kept because fresh ones would change the probability ratio of the update. The
-    episodes are played in rounds of envs.num_envs; noise is drawn before: on physx_cpu their size is no matter.
+    Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success; and value (T+1, N),
+    V(o_T) last. Without explore also the privileged state, for u_r2 alone. The particles are kept because fresh ones
+    would change the probability ratio of the update. Episodes are played in rounds of envs.num_envs; noise is drawn
+    before: on physx_cpu their size is no matter.
     """
     steps, count, (action_dim,) = gym.spec(args.env_id).max_episode_steps, len(seeds), envs.single_action_space.shape
     device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
-    noise = torch.randn(steps, count, action_dim, device=device) * explore
+    noise = colored_noise(args.noise_beta, (count, action_dim, steps), np.random.default_rng(seeds)) * explore
+    noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
     z_noise = torch.randn(steps + 1, count, n, config["z_dim"], device=device)
     u_noise = torch.randn(steps + 1, count, n, config["u_dim"], device=device) * args.particle_noise
     data = {"value": torch.empty(steps + 1, count, device=device)}
@@ -465,10 +466,12 @@ def rollout_with_belief(
     for first in range(0, count, envs.num_envs):
         now = slice(first, min(first + envs.num_envs, count))  # the episodes of this round
         playing = now.stop - now.start  # in the last round some environments may only repeat what others do
-        obs, initial = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
+        obs, info = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
         memory = None
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name][:playing], device=device) for name in ("rgb", "joints")}
+            if not explore:
+                step["state"] = torch.as_tensor(info["state"][:playing], device=device)
             step["particles"], memory = agent.draw_particles(step, memory, z_noise[t, now], u_noise[t, now])
             policy, data["value"][t, now] = agent(step)
             if t == steps:
@@ -477,7 +480,7 @@ def rollout_with_belief(
             step["logprob"] = policy.log_prob(step["action"]).sum(-1)
             action = step["action"].clamp(-1, 1).cpu().numpy()
             obs, reward, _, _, info = envs.step(np.resize(action, (envs.num_envs, action_dim)))
-            for name, x in (("reward", reward), ("success", info["success"]), ("cue", initial["cue"])):
+            for name, x in (("reward", reward), ("success", info["success"])):
                 step[name] = torch.as_tensor(x[:playing], dtype=torch.float32, device=device)
             for name, x in step.items():
                 if name not in data:
@@ -491,66 +494,18 @@ def rollout_with_belief(
 # ---------------------------------------------------------------- evaluation
 
 
-def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
-    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
-
-    The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
-    """
-    varies = y.amax(0) > y.amin(0)
-    if not varies.any():
-        return math.nan
-    x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
-    classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
-    model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
-    model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
-    return float(np.mean([model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]))
-
-
 @torch.no_grad()
-def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: np.ndarray) -> dict[str, torch.Tensor]:
-    """What the belief makes of episodes index (E,).
-
-    h (E, T+1, 256); u (E, T+1, u_dim), action (E, T, A), cue (E, K) as they were; z, z_mean (E, T+1, z_dim) of q(z|u,h)
-    particle (E, T+1, u_dim): mean of 30 decoded prior samples; posterior (E, T+1, u_dim): z_mean decoded
-    nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows of
-    three possible places is right about each; nll_posterior (E, T+1): -log p(u|z,h) under z
-    """
-    torch.manual_seed(0)  # the same noise at every look, so that looks compare
-    parts = []
+def validate_belief(belief: nn.Module, episodes: Episodes, index: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """u and mean particle, both (T+1, E, u_dim), of episodes index (E,) that the belief is not trained on."""
+    torch.manual_seed(0)  # the same noise every time, so that errors compare
+    u, estimate = [], []
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
-        u, h = batch["u"], encode_history(belief.history, batch)
-        nll, _, z, mean = elbo_terms(belief, posterior, u, h)
-        decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
-        log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
-        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "z_mean": mean}
-        part |= {"nll_prior": math.log(30) - log_p.logsumexp(-1), "nll_posterior": nll}
-        part["posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
-        part = {name: x.transpose(0, 1) for name, x in {**part, "action": batch["actions"]}.items()}
-        parts.append({**part, "cue": batch["cue"]})
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) -> dict:
-    """What the belief remembers, lists by time step.
-
-    fit and test are encode's of two sets of episodes that the belief was not trained on: read-outs are fitted on the
-    first and everything is measured on the second.
-    """
-    report = {name: test[name].mean().item() for name in ("nll_prior", "nll_posterior")}
-    for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
-        residual = (test["u"] - test[source]).square().sum((0, 2))
-        report[name] = (1 - residual / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
-    for name in ("h", "particle", "u"):
-        steps = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
-        report[f"cue_from_{name}"] = [readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
-    pairs, pairs_test = (torch.cat([x["z_mean"][:, :-1], x["z_mean"][:, 1:]], -1).flatten(0, 1) for x in (fit, test))
-    action, action_test = (x["action"].flatten(0, 1) for x in (fit, test))
-    report["action_readout"] = readout_score(pairs, action, pairs_test, action_test)
-    cue = fit["cue"][:, fit["cue"].amax(0) > fit["cue"].amin(0)]
-    classes = [] if (cue != cue.round()).any() else [len(column.unique()) for column in cue.T]
-    report["cue_chance"] = float(np.mean([1 / n for n in classes])) if classes else 0.0
-    return report
+        h = encode_history(belief.history, batch)
+        decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, belief.config["z_dim"], device=h.device))
+        u.append(batch["u"])
+        estimate.append(decoded.mean.mean(-2))
+    return torch.cat(u, 1), torch.cat(estimate, 1)
 
 
 def success_and_return(data: dict[str, torch.Tensor]) -> dict[str, float]:
@@ -573,29 +528,37 @@ def make_video(data: dict[str, torch.Tensor]) -> bytes:
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1)
 
 
+def r_squared(u: torch.Tensor, estimate: torch.Tensor) -> float:
+    """R2 of u (M, u_dim) from its estimate: 1 if that is u, 0 if it is no better than the mean of u."""
+    return 1 - ((u - estimate).square().sum() / (u - u.mean(0)).square().sum()).item()
+
+
+@torch.no_grad()
 def evaluate_with_belief(
-    envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, readout_data: dict[str, torch.Tensor]
+    envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, phi: StateEncoder
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    cue_readout: cue (M, K) from mean particle (M, u_dim), fitted on readout_data, random actions', and tested here.
+    u_r2, u_r2_at_end: what the belief knows where its agent takes it, R2 of u = phi(s) from the mean particle, over all
+    steps and at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
     """
     torch.manual_seed(0)
     data = rollout_with_belief(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), explore=False)
-    particle, cue = data["particles"].mean(-2).flatten(0, 1), data["cue"].flatten(0, 1)
-    cue_readout = readout_score(readout_data["particle"], readout_data["cue"], particle, cue)
-    return {**success_and_return(data), "cue_readout": cue_readout}, make_video(data)
+    u, estimate = phi(data["state"]).mean, data["particles"].mean(-2)
+    metrics = success_and_return(data)
+    metrics["u_r2"] = r_squared(u.flatten(0, 1), estimate.flatten(0, 1))
+    metrics["u_r2_at_end"] = r_squared(u[-1], estimate[-1])
+    return metrics, make_video(data)
 
 
 # ---------------------------------------------------------------- training
 
 
 def train_belief(args: Args, path: Path) -> None:
-    """Train Believer's belief on stage 1's output as aib_belief.py does; writes belief.pt and diagnostics into path."""
+    """Train Believer's belief on stage 1's output as aib_belief.py does; writes belief.pt into path."""
     device = torch.device(args.device)
     episodes, stored = load_episodes(args)
-    # of the held-out episodes, read-outs are fitted on one half and tested on the other
-    train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-stored["num_val"], -(stored["num_val"] // 2)])
+    train, held_out = np.split(np.arange(args.num_episodes), [-stored["num_val"]])
     sample = episodes(train[:1])
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
     config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints, "u_dim": stored["u_dim"]}
@@ -640,65 +603,66 @@ def train_belief(args: Args, path: Path) -> None:
                 writer.add_scalar(f"belief/{name}", value, update)
 
         if update % args.held_out_every == 0 or update == args.num_updates:
-            held_out = encode(model["belief"], model["posterior"], episodes, test_on)
-            error = (held_out["u"] - held_out["particle"]).square().sum(-1).mean().item()
+            u, estimate = validate_belief(model["belief"], episodes, held_out)
+            error = (u - estimate).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
-            writer.add_scalar("belief/held_out_nll_prior", held_out["nll_prior"].mean(), update)
-            writer.add_scalar("belief/held_out_nll_posterior", held_out["nll_posterior"].mean(), update)
             bar.set_postfix(held_out_error=f"{error:.3f}")
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "belief_checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
 
     # the last weights: held-out error and likelihood are best before the belief remembers
-    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
-    report = diagnose_belief(fit, test)
     writer.close()
-    save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
-    some = fit["particle"][:, ::8]  # every 8th step is enough
-    readout_data = {"particle": some.flatten(0, 1), "cue": fit["cue"].repeat_interleave(some.shape[1], 0)}
-    content = {"kind": "believer_belief", "config": config, "readout_data": readout_data}
+    content = {"kind": "believer_belief", "config": config, "phi": stored["phi"]}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
-    known = [f"{name} {report[name][-1]:.2f}" for name in ("cue_from_u", "cue_from_particle", "u_r2_prior")]
-    print(f"{path / 'belief.pt'}, at the last step of held-out episodes: {', '.join(known)}")
+    known = r_squared(*(x[-1] for x in validate_belief(model["belief"], episodes, held_out)))
+    print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {known:.2f}")
+
+
+def evaluate_checkpoint(args: Args) -> None:
+    """Evaluate the agent of --checkpoint, on the task it was trained on; writes evaluation.json and .mp4 beside it."""
+    file = Path(args.checkpoint.format(**vars(args)))
+    stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_believer agent")
+    for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
+        setattr(args, name, stored[name])
+    check_task(args)
+    envs, device = make_envs(args), torch.device(args.device)
+    (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
+    belief = BelieverBelief(stored["config"], args.amp)
+    agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
+    phi = StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"]).to(device)
+    phi.load_state_dict(stored["phi"])
+    agent.load_state_dict(stored["agent"])
+    metrics, video = evaluate_with_belief(envs, agent, args, phi)
+    save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
+    save(file.with_name("evaluation.mp4"), video)
+    print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
+    envs.close()
 
 
 def main(args: Args) -> None:
-    """Train belief and agent of the Believer baseline, or with --evaluate only evaluate an agent."""
-    if args.evaluate:
-        file = Path(args.checkpoint.format(**vars(args)))
-        stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_believer agent")
-        for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
-            setattr(args, name, stored[name])
+    """Train belief and agent of the Believer baseline."""
     check_task(args)
     per_iteration = gym.spec(args.env_id).max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // per_iteration)
-    if not args.evaluate:
-        path = open_run(args)
-        resume = (path / "checkpoint.pt").exists()
-        checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
-        if checkpoint.get("iteration") == num_iterations:
-            print(f"{path} is finished; --overwrite makes it anew")
-            return
-        if not (path / "belief.pt").exists():
-            train_belief(args, path)
-            torch.cuda.empty_cache()  # the simulator needs the GPU's memory too
-        stored = load(path / "belief.pt", "start anew with --overwrite", kind="believer_belief")
+    path = open_run(args)
+    resume = (path / "checkpoint.pt").exists()
+    checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
+    if checkpoint.get("iteration") == num_iterations:
+        print(f"{path} is finished; --overwrite makes it anew")
+        return
+    if not (path / "belief.pt").exists():
+        train_belief(args, path)
+        torch.cuda.empty_cache()  # the simulator needs the GPU's memory too
+    stored = load(path / "belief.pt", "start anew with --overwrite", kind="believer_belief")
 
     envs, device = make_envs(args), torch.device(args.device)
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     torch.manual_seed(args.seed)
     belief = BelieverBelief(stored["config"], args.amp)
     agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
-    if args.evaluate:
-        agent.load_state_dict(stored["agent"])
-        metrics, video = evaluate_with_belief(envs, agent, args, stored["readout_data"])
-        save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
-        save(file.with_name("evaluation.mp4"), video)
-        print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
-        envs.close()
-        return
-
+    phi = StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"]).to(device)
+    phi.load_state_dict(stored["phi"])
     agent.belief.load_state_dict(stored["belief"])
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
@@ -736,14 +700,13 @@ def main(args: Args) -> None:
         del data, batch, losses  # a gigabyte of images and a graph: not two at a time
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
-            metrics, video = evaluate_with_belief(envs, agent, args, stored["readout_data"])
+            metrics, video = evaluate_with_belief(envs, agent, args, phi)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
-            metrics.pop("cue_readout")  # the columns of eval.csv are those of plain PPO
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
             lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"config": stored["config"], "readout_data": stored["readout_data"], "agent": agent.state_dict()}
+            content = {"config": stored["config"], "phi": stored["phi"], "agent": agent.state_dict()}
             content |= {"kind": "ppo_believer agent", "global_step": global_step}
             save(path / "agent.pt", {**asdict(args), **content})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
@@ -843,6 +806,24 @@ def lighten_meshes(task: gym.Env, triangles: int) -> None:
             entity.remove_component(old)
 
 
+def flatten_ground(task: gym.Env) -> None:
+    """Draw the ground as two triangles between its corners instead of ManiSkill's 20,000: the same picture."""
+    for entity in task.scene.actors["ground"]._objs:
+        grid = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        (part,) = grid.render_shapes[0].parts
+        edge = np.abs(part.vertices[:, :2] - part.vertices[:, :2].mean(0))
+        corners = (edge == edge.max(0)).all(1)  # in the order (-, -), (-, +), (+, -), (+, +)
+        vertices, normals, uvs = (
+            part.vertices[corners],
+            part.get_vertex_normal()[corners],
+            part.get_vertex_uv()[corners],
+        )
+        plane, triangles = sapien.render.RenderBodyComponent(), np.array([[0, 2, 3], [0, 3, 1]])
+        plane.attach(sapien.render.RenderShapeTriangleMesh(vertices, triangles, normals, uvs, part.material))
+        entity.remove_component(grid)
+        entity.add_component(plane)
+
+
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
@@ -853,6 +834,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
         if args.mesh_triangles:
             lighten_meshes(env.unwrapped, args.mesh_triangles)
+            flatten_ground(env.unwrapped)
         env = TaskView(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
@@ -914,6 +896,9 @@ def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
         least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
         if isinstance(value, int | float) and not value >= least:
             fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
+        most = {"gamma": 1, "gae_lambda": 1, "noise_beta": 2}.get(name, math.inf)
+        if isinstance(value, int | float) and value > most:
+            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at most {most}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     return args
@@ -984,6 +969,10 @@ def run_stage(script: str, args: Args) -> None:
 
 if __name__ == "__main__":
     try:
-        main(parse_args(TASKS, SMALL, QUICK))
+        args = parse_args(TASKS, SMALL, QUICK)
+        if args.evaluate:
+            evaluate_checkpoint(args)
+        else:
+            main(args)
     except KeyboardInterrupt:
         sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")

@@ -68,7 +68,10 @@ def toy_task(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def train(module: ModuleType, **arguments: object) -> Path:
-    """Run a script's main on the toy task; its run directory."""
+    """Train, or with evaluate only evaluate, on the toy task; the run directory."""
     args = module.Args(env_id=TOY, **arguments)
-    module.main(args)
+    if arguments.get("evaluate"):
+        module.evaluate_checkpoint(args)
+    else:
+        module.main(args)
     return Path("runs") / f"{TOY}__{args.exp_name}__{args.seed}"

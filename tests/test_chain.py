@@ -50,26 +50,27 @@ def test_dataset(quick_runs: Path) -> None:
 def test_results(quick_runs: Path, script: str) -> None:
     path = quick_runs / f"{TASK}__{script}_quick__1"
     rows = list(csv.DictReader((path / "eval.csv").open()))
-    assert list(rows[0]) == ["iteration", "global_step", "success_once", "success_at_end", "return"]
+    columns = ["iteration", "global_step", "success_once", "success_at_end", "return"]
+    of_belief = ["u_r2", "u_r2_at_end"] if script != "ppo_baseline" else []
+    assert list(rows[0]) == columns + of_belief
     assert [row["global_step"] for row in rows] == ["360"]
     agent = torch.load(path / "agent.pt", weights_only=True)
     assert (agent["kind"], agent["env_id"], agent["global_step"]) == (f"{script} agent", TASK, 360)
     events = EventAccumulator(str(path)).Reload()
     tags = {"charts/SPS", "losses/policy_loss", "losses/value_loss", "losses/approx_kl"}
     tags |= {"train/success_once", "eval/success_once", "eval/success_at_end", "eval/return"}
-    tags |= {"time/rollout", "time/update"} | ({"eval/cue_readout"} if script != "ppo_baseline" else set())
+    tags |= {"time/rollout", "time/update"} | {f"eval/{name}" for name in of_belief}
     assert tags <= set(events.Tags()["scalars"])
     video = iio.imread(sorted((path / "videos").iterdir())[-1])
     assert video.shape == (60, 256, 512, 3) and np.abs(video[0].astype(int) - video[-1]).mean() > 1
 
 
 def test_stages_leave_their_diagnostics(quick_runs: Path) -> None:
-    for name in ("aib_belief", "ppo_believer"):
-        path = quick_runs / f"{TASK}__{name}_quick__1"
-        report = json.loads((path / "diagnostics.json").read_text())
-        assert {"nll_prior", "nll_posterior", "action_readout", "cue_chance"} <= report.keys()
-        assert len(report["cue_from_h"]) == len(report["u_r2_prior"]) == 61
-        assert ("flow_gain" in report) == (name == "aib_belief")
+    report = json.loads((quick_runs / f"{TASK}__aib_belief_quick__1" / "diagnostics.json").read_text())
+    assert {"nll_prior", "nll_posterior", "action_readout", "cue_chance", "flow_gain"} <= report.keys()
+    assert len(report["cue_from_h"]) == len(report["u_r2_prior"]) == 61
+    events = EventAccumulator(str(quick_runs / f"{TASK}__ppo_believer_quick__1" / "belief_events")).Reload()
+    assert events.Scalars("belief/held_out_error")[-1].value > 0
     events = EventAccumulator(str(quick_runs / f"{TASK}__aib_repr_quick__1")).Reload()
     assert 0 <= events.Scalars("held_out/active_dimensions")[-1].value <= 16
 

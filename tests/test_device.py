@@ -71,8 +71,11 @@ def test_stage_2(head: str, monkeypatch: pytest.MonkeyPatch) -> None:
     else:
         losses = module.belief_losses(model, batch, module.Args(action_head=head, bptt_steps=4))
     losses["total"].backward()
-    held_out = module.encode(belief, model["posterior"], lambda index: batch, np.arange(B))
-    assert {x.device.type for x in (*losses.values(), *held_out.values())} == {"meta"}
+    if head == "believer":
+        held_out = module.validate_belief(belief, lambda index: batch, np.arange(B))
+    else:
+        held_out = module.encode(belief, model["posterior"], lambda index: batch, np.arange(B)).values()
+    assert {x.device.type for x in (*losses.values(), *held_out)} == {"meta"}
 
 
 @pytest.mark.parametrize("module", [ppo_aib, ppo_believer, ppo_baseline])

@@ -130,4 +130,28 @@ def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:
 
     names = set(stock.unwrapped.scene.actors)
     assert {"ball", "goal_region", "ground"} <= names
-    assert all(shapes(stock, name) == shapes(light, name) for name in names)
+    assert all(shapes(stock, name) == shapes(light, name) for name in names - {"ground"})
+
+
+def test_the_ground_of_two_triangles_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    flat = aib_repr.make_task(aib_repr.Args(env_id=TASK), 1)
+    body = flat.unwrapped.scene.actors["ground"]._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
+    assert len(body.render_shapes[0].parts[0].triangles) == 2
+    monkeypatch.setattr(aib_repr, "flatten_ground", lambda task: None)
+    grid = aib_repr.make_task(aib_repr.Args(env_id=TASK), 1)
+    pictures, expected = (env.reset(seed=1)[0]["rgb"].astype(int) for env in (flat, grid))
+    assert np.abs(pictures - expected).max() <= 1
+    flat.close()
+    grid.close()
+
+
+def test_random_actions_are_uniform_at_every_step_whatever_their_colour() -> None:
+    persistence = []
+    for beta in (0.0, 0.7):
+        args = aib_repr.Args(noise_beta=beta)
+        actions = np.stack([aib_repr.random_actions(args, episode, 60, 8) for episode in range(2000)])
+        assert actions.shape == (2000, 60, 8) and actions.dtype == np.float32 and np.abs(actions).max() <= 1
+        deciles = np.quantile(actions.transpose(1, 0, 2).reshape(60, -1), np.linspace(0.1, 0.9, 9), axis=1)
+        assert np.abs(deciles - np.linspace(-0.8, 0.8, 9)[:, None]).max() < 0.06 + 0.06 * beta
+        persistence.append(np.corrcoef(actions[:, 1:].ravel(), actions[:, :-1].ravel())[0, 1])
+    assert abs(persistence[0]) < 0.01 and persistence[1] > 0.3

@@ -80,6 +80,11 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_believer", ["--eval-every", "0"], ["--eval-every 0"]),
         ("ppo_baseline", ["--seed", "-1"], ["--seed -1"]),
         ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
+        ("ppo_baseline", ["--noise-beta", "-0.1"], ["--noise-beta -0.1", "at least 0"]),
+        ("ppo_aib", ["--noise-beta", "2.5"], ["--noise-beta 2.5", "at most 2"]),
+        ("ppo_believer", ["--noise-beta", "nan"], ["--noise-beta nan"]),
+        ("aib_repr", ["--noise-beta", "3"], ["--noise-beta 3.0", "at most 2"]),
+        ("ppo_baseline", ["--gamma", "1.5"], ["--gamma 1.5", "at most 1"]),
         ("ppo_baseline", ["--device", "cuda"], ["no CUDA device", "--device cpu"]),
     ],
 )

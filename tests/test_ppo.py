@@ -55,9 +55,7 @@ def test_rollout_arrays(toy_stages: Path) -> None:
         "value": ((11, 8), torch.float32),
         "reward": ((10, 8), torch.float32),
         "success": ((10, 8), torch.float32),
-        "cue": ((10, 8, 1), torch.float32),
     }
-    assert data["cue"].amax(0).equal(data["cue"].amin(0)) and len(data["cue"].unique()) > 1
 
 
 def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path) -> None:
@@ -86,16 +84,81 @@ def test_particle_noise_is_the_decoders(toy_stages: Path) -> None:
     assert drawn.std(1).mean() > 0.5 and means.std(1).mean() < 0.2  # the decoder's std is still about softplus(0) + 0.1
 
 
-def test_the_cue_readout_is_fitted_on_random_actions_episodes(toy_stages: Path) -> None:
-    agent, _ = play(toy_stages)
-    args = ppo_aib.Args(env_id=TOY, **small(ppo_aib, toy_stages))
-    particle, colour = torch.randn(30, 16), torch.arange(30)[:, None] % 3
-    for readout_data, known in (
-        ({"particle": particle, "cue": torch.zeros(30, 1)}, False),  # one colour only: nothing to tell
-        ({"particle": particle, "cue": colour.float()}, True),
-    ):
-        metrics, _ = ppo_aib.evaluate_with_belief(toy.make_envs(args), agent, args, readout_data)
-        assert math.isnan(metrics["cue_readout"]) != known
+@pytest.mark.parametrize("script", ["ppo_aib", "ppo_believer"])
+def test_u_r2_tells_what_the_belief_knows_of_the_episodes_just_played(
+    toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    """The agent's particles are replaced by ones that are u but for known noise; the true u is that of the seeds."""
+    module, arguments = SCRIPTS[script], small(SCRIPTS[script], toy_stages, num_eval_episodes=16)
+    args = module.Args(env_id=TOY, **arguments)
+    stored = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)
+    phi = module.StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"])
+    phi.load_state_dict(stored["phi"])
+    played, rollout = [], module.rollout_with_belief
+
+    def informed(*arguments: object, explore: bool) -> dict[str, torch.Tensor]:
+        data = rollout(*arguments, explore=explore)
+        u = phi(data["state"]).mean
+        error = size * (u - u.mean((0, 1))).square().mean((0, 1)).sqrt() * torch.randn_like(u)
+        played.append(data)
+        return {**data, "particles": (u + error)[:, :, None].expand(-1, -1, 30, -1)}
+
+    monkeypatch.setattr(module, "rollout_with_belief", informed)
+    belief = ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief
+    agent = module.BeliefAgent(belief(stored["config"]), 3, 2, 0.6)
+    for size, expected in ((0.0, 1.0), (0.5**0.5, 0.5)):  # noqa: B007  (informed reads it)
+        metrics, _ = module.evaluate_with_belief(toy.make_envs(args), agent, args, phi)
+        assert metrics["u_r2"] == pytest.approx(expected, abs=0.1)
+    assert list(metrics)[-2:] == ["u_r2", "u_r2_at_end"] and metrics["u_r2_at_end"] < 1
+    envs = toy.make_envs(args)
+    for i in range(0, 16, 3):  # three episodes at a time, as the rollout plays them
+        _, info = envs.reset(seed=[module.EVAL_SEED + min(i + k, 15) for k in range(3)])
+        rows = slice(i, min(i + 3, 16))
+        assert np.array_equal(played[0]["state"][0, rows], info["state"][: rows.stop - i])
+    random = rollout(envs, agent, args, np.arange(3), explore=True)
+    assert "state" not in random, "training does not see the privileged state"
+
+
+def test_r_squared() -> None:
+    u = torch.tensor([[0.0, 1.0], [2.0, 1.0], [4.0, 1.0]])
+    assert ppo_aib.r_squared(u, u) == 1 and ppo_aib.r_squared(u, u.mean(0).expand(3, 2)) == 0
+    assert ppo_aib.r_squared(u, u + 1) == pytest.approx(1 - 6 / 8)
+
+
+def test_exploration_noise_is_coloured_and_standard_normal_at_every_step() -> None:
+    steps, correlation = 60, {}
+    frequency = np.abs(np.fft.fftfreq(steps))
+    for beta in (0.0, 0.5, 1.0, 2.0):
+        noise = ppo_aib.colored_noise(beta, (4000, 8, steps), np.random.default_rng(0)).reshape(-1, steps)
+        assert np.abs(noise.mean(0)).max() < 0.03, "32,000 draws a step: 5 standard errors"
+        assert np.abs(noise.std(0) - 1).max() < 0.02
+        power = frequency.clip(1 / steps) ** -beta
+        expected = (power * np.cos(2 * np.pi * frequency)).sum() / power.sum()
+        correlation[beta] = (noise[:, 1:] * noise[:, :-1]).mean()
+        assert correlation[beta] == pytest.approx(expected, abs=0.01), "what the spectrum says"
+    assert correlation[0.0] == pytest.approx(0, abs=0.01), "white"
+    assert correlation[0.0] < correlation[0.5] < correlation[1.0] < correlation[2.0] < 1
+
+
+def test_the_three_methods_explore_with_the_same_noise(toy_stages: Path) -> None:
+    drawn = []
+    for script in METHODS:
+        module, policy = SCRIPTS[script], []
+        args = module.Args(env_id=TOY, noise_beta=0.7, **small(module, toy_stages))
+        if script == "ppo_baseline":
+            agent, rollout = module.Agent([36, 36, 3], 3, 2, 0.6), module.rollout
+        else:
+            stored = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)
+            belief = ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief
+            agent, rollout = module.BeliefAgent(belief(stored["config"]), 3, 2, 0.6), module.rollout_with_belief
+        agent.register_forward_hook(lambda _, inputs, output, seen=policy: seen.append(output[0]))
+        for seeds in (np.arange(3), np.arange(3, 6)):  # one round each
+            data = rollout(toy.make_envs(args), agent, args, seeds)
+            steps = zip(data["action"], policy[-11:], strict=False)
+            drawn.append(torch.stack([(action - p.mean) / p.stddev for action, p in steps]))
+    for other in (drawn[2], drawn[4]):
+        assert torch.allclose(drawn[0], other, atol=1e-4)
+    assert (drawn[0] - drawn[1]).abs().max() > 0.1, "other episodes, other noise"
 
 
 @pytest.mark.parametrize("script", METHODS)
@@ -208,7 +271,7 @@ def test_evaluate_takes_over_what_the_episodes_depend_on(toy_task: Path, monkeyp
     seen = []
     monkeypatch.setattr(ppo_baseline, "make_envs", lambda args: seen.append(args) or toy.make_envs(args))
     options = dict(evaluate=True, checkpoint=str(agent), num_eval_episodes=4, num_workers=2)
-    ppo_baseline.main(ppo_baseline.Args(num_envs=3, amp=True, **options))
+    ppo_baseline.evaluate_checkpoint(ppo_baseline.Args(num_envs=3, amp=True, **options))
     assert (seen[0].env_id, seen[0].num_envs, seen[0].amp) == (TOY, SMALL["num_envs"], False)
 
 

@@ -10,7 +10,8 @@ from conftest import ROOT, SCRIPTS
 SOURCES = {name: (ROOT / f"{name}.py").read_text() for name in SCRIPTS}
 TREES = {name: ast.parse(source) for name, source in SOURCES.items()}
 SECTIONS = ["arguments", "networks", "losses", "data", "evaluation", "training", "simulator", "files and stages"]
-LINES = {"aib_repr": 566, "aib_belief": 605, "ppo_aib": 734, "ppo_believer": 989, "ppo_baseline": 575}
+OWN = ("Args", "main", "evaluate_checkpoint")  # every script has one of its own
+LINES = {"aib_repr": 603, "aib_belief": 606, "ppo_aib": 787, "ppo_believer": 978, "ppo_baseline": 615}
 
 
 def test_no_script_imports_another() -> None:
@@ -29,7 +30,7 @@ def test_what_has_one_name_is_one_text() -> None:
     for script, tree in TREES.items():
         for node in tree.body:
             text = ast.get_source_segment(SOURCES[script], node)  # comments too
-            if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name not in ("Args", "main"):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name not in OWN:
                 copies[node.name][script] = text
             elif (
                 isinstance(node, ast.Assign)
