@@ -36,7 +36,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
-FRAMES = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
+CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -61,7 +61,7 @@ class Args:
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, through which the policy does not see"""
-    mesh_triangles: int = 0 if CUDA else 500
+    robot_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU"""
@@ -70,7 +70,7 @@ class Args:
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
-    """delete what the run directory holds and start anew, every time it is given"""
+    """delete what the run directory holds and start again, every time it is given"""
 
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
@@ -103,13 +103,17 @@ class Args:
     history_joints: bool = True
     """joints in the history, as in the paper; its authors' code has the image alone"""
     image_shift: int = 0
-    """shift each episode's images by up to so many pixels while the belief is trained, against learning by heart"""
+    """shift each episode's images by up to so many pixels while the belief is trained, against overfitting"""
     belief_amp: bool = BFLOAT16
     """image network in bfloat16 while the belief is trained"""
-    held_out_every: int = 50
-    """updates between checkpoints, each with a look at held-out episodes"""
+    val_every: int = 50
+    """updates between checkpoints, each with a validation"""
 
 
+# what an argument may be; elsewhere whole numbers from 1 and others from 0
+LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_shift=(0, math.inf))
+MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
+TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
 QUICK = dict(exp_name="aib_belief_quick", num_episodes=8, num_updates=4, batch_episodes=4)
@@ -121,7 +125,9 @@ QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 
 def mlp(sizes: list[int]) -> nn.Sequential:
     """Linear layers of the given sizes with ReLU between them."""
-    layers = [module for i, o in pairwise(sizes) for module in (nn.Linear(i, o), nn.ReLU())]
+    layers = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
 
@@ -153,8 +159,15 @@ class NatureCNN(nn.Module):
     def __init__(self, image_shape: list[int], size: int, amp: bool):
         super().__init__()
         self.amp = amp  # in bfloat16
-        convs = [nn.Conv2d(image_shape[-1], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)]
-        self.conv = nn.Sequential(*[module for conv in convs for module in (conv, nn.ReLU())], nn.Flatten())
+        self.conv = nn.Sequential(
+            nn.Conv2d(image_shape[-1], 32, 8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
         self.out = nn.Sequential(nn.Linear(flat, size), nn.ReLU())
 
@@ -199,10 +212,10 @@ class HistoryEncoder(nn.Module):
         x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
-    def forward(self, x: torch.Tensor, memory: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """x (T, B, .) of T steps that go on from memory, the GRU's state (None: start) -> h (T, B, 256), memory."""
-        output, memory = self.gru(x, memory)
-        return self.out(torch.cat([output, x], -1)), memory
+    def forward(self, x: torch.Tensor, hidden: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """x (T, B, .) of T steps that follow the GRU's state hidden (None: start) -> h (T, B, 256), hidden."""
+        output, hidden = self.gru(x, hidden)
+        return self.out(torch.cat([output, x], -1)), hidden
 
 
 def chrono_init(gru: nn.GRU, steps: int) -> None:
@@ -243,17 +256,17 @@ def encode_history(history: nn.Module, batch: dict[str, torch.Tensor], bptt_step
     All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in chunks
     that the backward pass computes once more. bptt_steps cuts back-propagation through time into pieces.
     """
-    frames = [batch[name].flatten(0, 1).split(FRAMES) for name in ("rgb", "joints")]
+    frames = [batch[name].flatten(0, 1).split(CNN_CHUNK) for name in ("rgb", "joints")]
     chunks = list(zip(*frames, strict=True))
     if len(chunks) == 1:
         x = history.embed(*chunks[0])
     else:
-        again = torch.utils.checkpoint.checkpoint
-        x = torch.cat([again(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
-    outputs, memory = [], None
+        recompute = torch.utils.checkpoint.checkpoint
+        x = torch.cat([recompute(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
+    outputs, hidden = [], None
     for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
-        h, memory = history(piece, memory)
-        memory = memory.detach()
+        h, hidden = history(piece, hidden)
+        hidden = hidden.detach()
         outputs.append(h)
     return torch.cat(outputs)
 
@@ -299,7 +312,7 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Ar
 # ---------------------------------------------------------------- data
 
 
-class Episodes:
+class EpisodeDataset:
     """Whole episodes of dataset/ with u, time first; images on the GPU where they fit in half of its free memory."""
 
     def __init__(self, dataset: Path, u: torch.Tensor, device: torch.device):
@@ -327,14 +340,14 @@ def shift_images(rgb: torch.Tensor, pixels: int, rng: np.random.Generator) -> No
         images.copy_(images.roll(shift, (1, 2)))
 
 
-def load_episodes(args: Args) -> tuple[Episodes, dict]:
+def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
     size = QUICK if args.quick else SMALL if args.small else {}
     if not (path / "repr.pt").exists() and args.repr_dir == size.get("repr_dir", Args.repr_dir):
         run_stage("aib_repr.py", args)
-    hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_repr.py --overwrite"
-    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
+    hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
+    task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
     stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
@@ -342,7 +355,7 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
     try:
         with torch.no_grad():
             u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
-        return Episodes(path / "dataset", u, torch.device(args.device)), stored
+        return EpisodeDataset(path / "dataset", u, torch.device(args.device)), stored
     except (OSError, ValueError) as error:
         fail(f"{path / 'dataset'} is damaged or incomplete ({error}); {hint}")
 
@@ -350,7 +363,7 @@ def load_episodes(args: Args) -> tuple[Episodes, dict]:
 # ---------------------------------------------------------------- evaluation
 
 
-def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
+def probe_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
     """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
 
     The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
@@ -366,7 +379,9 @@ def readout_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test
 
 
 @torch.no_grad()
-def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: np.ndarray) -> dict[str, torch.Tensor]:
+def encode(
+    belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, index: np.ndarray
+) -> dict[str, torch.Tensor]:
     """What the belief makes of episodes index (E,).
 
     h (E, T+1, 256); u (E, T+1, u_dim), action (E, T, A), cue (E, K) as they were; z, z_mean (E, T+1, z_dim) of q(z|u,h)
@@ -390,11 +405,11 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: Episodes, index: n
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) -> dict:
+def probe_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) -> dict:
     """What the belief remembers, lists by time step.
 
-    fit and test are encode's of two sets of episodes that the belief was not trained on: read-outs are fitted on the
-    first and everything is measured on the second.
+    fit and test are encode's of two sets of episodes that the belief was not trained on: linear probes are fitted on
+    the first and everything is measured on the second.
     """
     report = {name: test[name].mean().item() for name in ("nll_prior", "nll_posterior")}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
@@ -402,10 +417,10 @@ def diagnose_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor])
         report[name] = (1 - residual / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
     for name in ("h", "particle", "u"):
         steps = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
-        report[f"cue_from_{name}"] = [readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
+        report[f"cue_from_{name}"] = [probe_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
     pairs, pairs_test = (torch.cat([x["z_mean"][:, :-1], x["z_mean"][:, 1:]], -1).flatten(0, 1) for x in (fit, test))
     action, action_test = (x["action"].flatten(0, 1) for x in (fit, test))
-    report["action_readout"] = readout_score(pairs, action, pairs_test, action_test)
+    report["action_readout"] = probe_score(pairs, action, pairs_test, action_test)
     cue = fit["cue"][:, fit["cue"].amax(0) > fit["cue"].amin(0)]
     classes = [] if (cue != cue.round()).any() else [len(column.unique()) for column in cue.T]
     report["cue_chance"] = float(np.mean([1 / n for n in classes])) if classes else 0.0
@@ -429,12 +444,13 @@ def flow_gain(head: nn.Module, z: torch.Tensor, action: torch.Tensor) -> tuple[f
 
 def main(args: Args) -> None:
     """Train the belief on whole episodes, report what it remembers of held-out ones."""
-    path, device = open_run(args), torch.device(args.device)
-    if (path / "belief.pt").exists():
-        print(f"{path / 'belief.pt'} is finished; --overwrite makes it anew")
+    path, device = check_run(args), torch.device(args.device)
+    if (path / "belief.pt").exists() and not args.overwrite:
+        print(f"{path / 'belief.pt'} is finished; --overwrite recreates it")
         return
     episodes, stored = load_episodes(args)
-    # of the held-out episodes, read-outs are fitted on one half and tested on the other
+    open_run(path, args)
+    # of the held-out episodes, linear probes are fitted on one half and tested on the other
     train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-stored["num_val"], -(stored["num_val"] // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
@@ -460,19 +476,20 @@ def main(args: Args) -> None:
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first = 0
     if (path / "checkpoint.pt").exists():
-        hint = "start anew with --overwrite"
+        hint = "start again with --overwrite"
         checkpoint = load(path / "checkpoint.pt", hint, kind="checkpoint", repr_crc=stored["crc"])
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         first = checkpoint["update"]
-        print(f"going on with {path} at update {first}", flush=True)
+        print(f"resuming {path} at update {first}", flush=True)
     writer = SummaryWriter(path, purge_step=first + 1)
     bar = tqdm(range(first + 1, args.num_updates + 1), "belief", args.num_updates, initial=first, unit="update")
 
     for update in bar:
         rng = np.random.default_rng([args.seed, update])
         batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
-        shift_images(batch["rgb"], args.image_shift, rng)
+        if args.image_shift:
+            shift_images(batch["rgb"], args.image_shift, rng)
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
         losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
@@ -483,7 +500,7 @@ def main(args: Args) -> None:
             for name, value in losses.items():
                 writer.add_scalar(f"belief/{name}", value, update)
 
-        if update % args.held_out_every == 0 or update == args.num_updates:
+        if update % args.val_every == 0 or update == args.num_updates:
             held_out = encode(model["belief"], model["posterior"], episodes, test_on)
             error = (held_out["u"] - held_out["particle"]).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
@@ -496,7 +513,7 @@ def main(args: Args) -> None:
 
     # the last weights: held-out error and likelihood are best before the belief remembers
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
-    report = diagnose_belief(fit, test)
+    report = probe_belief(fit, test)
     if args.action_head == "flow":
         report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["action"])
         sampled = flow_gain(model["head"], test["z"], test["action"])
@@ -518,45 +535,58 @@ def fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
-def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
+def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
-    settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
+    settings = TASKS.get(chosen.env_id, {})
+    if chosen.small:
+        settings = settings | SMALL
+    if chosen.quick:
+        settings = settings | QUICK
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
+    if args.small and args.quick:
+        fail("--small and --quick exclude each other; give one of them")
+    if "/" in args.exp_name:
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        least = 0 if isinstance(value, bool | float) else 1
-        least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
-        if isinstance(value, int | float) and not value >= least:
-            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
-        most = {"gamma": 1, "gae_lambda": 1, "noise_beta": 2}.get(name, math.inf)
-        if isinstance(value, int | float) and value > most:
-            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at most {most}")
+        low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
+        if isinstance(value, int | float) and not low <= value <= high:
+            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
+            fail(f"--{name.replace('_', '-')} {value} must be {bounds}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     return args
 
 
-def open_run(args: Args) -> Path:
-    """Create or re-open runs/{env_id}__{exp_name}__{seed}, for this process alone as long as it lives.
-
-    Fails when another process works there, or when what is there was made with other arguments.
-    """
+def check_run(args: Args) -> Path:
+    """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
+    if (path / "args.json").exists() and not args.overwrite:
+        recorded = json.loads((path / "args.json").read_text())
+        given = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
+        changed = [
+            f"{name}={recorded.get(name)} there, {x} here" for name, x in given.items() if recorded.get(name) != x
+        ]
+        if changed:
+            fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
+    return path
+
+
+def open_run(path: Path, args: Args) -> None:
+    """Make the run's directory, for this process alone as long as it lives, once all inputs have been read.
+
+    With --overwrite what it holds is deleted. Fails when another process works there.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
-    for file in path.iterdir() if args.overwrite else ():
-        shutil.rmtree(file) if file.is_dir() else file.unlink()
-    record, may_differ = path / "args.json", ("overwrite", "num_workers", "evaluate", "checkpoint")
-    here = {name: value for name, value in asdict(args).items() if name not in may_differ}
-    there = json.loads(record.read_text()) if record.exists() else here
-    differ = [f"{name}={there.get(name)} there, {x} here" for name, x in here.items() if there.get(name) != x]
-    if differ and any(file != record for file in path.iterdir()):
-        fail(f"{path} was made with other arguments ({'; '.join(differ)}); use --overwrite or another --exp-name")
-    save(record, json.dumps(here, indent=2).encode())
-    return path
+    if args.overwrite:
+        for file in path.iterdir():
+            shutil.rmtree(file) if file.is_dir() else file.unlink()
+    recorded = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
+    save(path / "args.json", json.dumps(recorded, indent=2).encode())
 
 
 def save(path: Path, content: dict | bytes) -> None:
@@ -572,11 +602,13 @@ def save(path: Path, content: dict | bytes) -> None:
 
 def load(path: Path, hint: str, **expected: object) -> dict:
     """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
+    if not path.exists():
+        fail(f"{path} does not exist")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         found = {name: content.get(name) for name in ("format", *expected)}
     except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
-        fail(f"{path} is missing, damaged or no file of these scripts ({type(error).__name__}); {hint}")
+        fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
     for name, value in {"format": FORMAT, **expected}.items():
         if found[name] != value:
             fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
@@ -586,21 +618,26 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 def run_stage(script: str, args: Args) -> None:
     """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
     command = [sys.executable, str(Path(__file__).with_name(script))]
-    command += ["--small"] * args.small + ["--quick"] * args.quick
-    task = ("env_id", "seed", "robot", "mesh_triangles", "num_episodes")
+    if args.small:
+        command.append("--small")
+    if args.quick:
+        command.append("--quick")
+    task = ("env_id", "seed", "robot", "robot_triangles", "num_episodes")
     for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
-    libc = ctypes.CDLL(None)  # its prctl(PR_SET_PDEATHSIG = 1): the stage ends when this process is killed
-    child = subprocess.Popen(command, start_new_session=True, preexec_fn=lambda: libc.prctl(1, signal.SIGTERM))
-    handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))  # Ctrl-C is handed on to it
-    if child.wait():
-        sys.exit(child.returncode)
-    signal.signal(signal.SIGINT, handler)
+    # prctl(PR_SET_PDEATHSIG, SIGKILL): the stage ends when this process is killed
+    stage = subprocess.Popen(command, preexec_fn=lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL))
+    try:
+        stage.wait()
+    except KeyboardInterrupt:
+        stage.wait()  # Ctrl-C reaches the stage, too, and the stage says so
+    if stage.returncode:
+        sys.exit(stage.returncode)
 
 
 if __name__ == "__main__":
     try:
-        main(parse_args({}, SMALL, QUICK))
+        main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes from the last checkpoint")

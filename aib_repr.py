@@ -7,10 +7,11 @@ Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events
 """
 
+import difflib
 import fcntl
 import json
 import math
-import multiprocessing.resource_tracker
+import multiprocessing
 import os
 import shutil
 import signal
@@ -64,7 +65,7 @@ class Args:
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, through which the policy does not see"""
-    mesh_triangles: int = 0 if CUDA else 500
+    robot_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU"""
@@ -73,7 +74,7 @@ class Args:
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
-    """delete what the run directory holds and start anew, every time it is given"""
+    """delete what the run directory holds and start again, every time it is given"""
 
     num_envs: int = 50
     """at most so many scenes at a time; physx_cuda draws one arm pose for all of them"""
@@ -81,8 +82,8 @@ class Args:
     """episodes of the random policy; 640 are enough for RememberColor3-v0, not for harder tasks"""
     noise_beta: float = 0.0
     """exponent of the random actions' spectrum 1/f**beta: 0 is white; with more the arm gets farther"""
-    val_share: float = 0.1
-    """share of the episodes held out"""
+    val_fraction: float = 0.1
+    """fraction of the episodes held out for validation"""
     epochs: int = 200
     """passes over the training transitions"""
     batch_size: int = 500
@@ -107,8 +108,12 @@ class Args:
     """image network in bfloat16"""
 
 
+# what an argument may be; elsewhere whole numbers from 1 and others from 0
+LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), val_fraction=(0, 1), noise_beta=(0, 2))
+MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
+TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, epochs=7, batch_size=100, learning_rate=1e-3)
-QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_share=0.5, epochs=2)
+QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_fraction=0.5, epochs=2)
 
 
 # ---------------------------------------------------------------- networks
@@ -116,7 +121,9 @@ QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_share=0.
 
 def mlp(sizes: list[int]) -> nn.Sequential:
     """Linear layers of the given sizes with ReLU between them."""
-    layers = [module for i, o in pairwise(sizes) for module in (nn.Linear(i, o), nn.ReLU())]
+    layers = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
 
@@ -148,8 +155,15 @@ class NatureCNN(nn.Module):
     def __init__(self, image_shape: list[int], size: int, amp: bool):
         super().__init__()
         self.amp = amp  # in bfloat16
-        convs = [nn.Conv2d(image_shape[-1], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)]
-        self.conv = nn.Sequential(*[module for conv in convs for module in (conv, nn.ReLU())], nn.Flatten())
+        self.conv = nn.Sequential(
+            nn.Conv2d(image_shape[-1], 32, 8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
         self.out = nn.Sequential(nn.Linear(flat, size), nn.ReLU())
 
@@ -238,7 +252,7 @@ def random_actions(args: Args, episode: int, steps: int, action_dim: int) -> np.
     return (2 * torch.special.ndtr(torch.from_numpy(noise.T)) - 1).float().numpy()
 
 
-def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
+def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     """Fill dataset/ from where it stopped with N whole episodes of the uniformly random policy; its memory maps:
 
     rgb (N, T+1, H, W, 3) uint8; joints, state (N, T+1, .); actions (N, T, A); rewards, success (N, T); cue (N, K).
@@ -247,7 +261,7 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
     if (path / "meta.json").exists():
         meta = json.loads((path / "meta.json").read_text())
         if meta["format"] != FORMAT:
-            fail(f"{path} has format {meta['format']}, this script writes {FORMAT}; start anew with --overwrite")
+            fail(f"{path} has format {meta['format']}, this script writes {FORMAT}; start again with --overwrite")
     arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy") if meta["episodes_done"]}
     if meta["episodes_done"] == args.num_episodes:
         return arrays
@@ -255,29 +269,29 @@ def collect(args: Args, path: Path) -> dict[str, np.ndarray]:
     steps, (action_dim,) = gym.spec(args.env_id).max_episode_steps, envs.single_action_space.shape
     bar = tqdm(total=count * steps, initial=meta["episodes_done"] * steps, desc="random policy", unit="step")
     for first in range(meta["episodes_done"], count, envs.num_envs):
-        now = np.arange(first, min(first + envs.num_envs, count))  # the episodes of this round
-        actions = np.stack([random_actions(args, episode, steps, action_dim) for episode in now])
-        seeds = (args.seed * 1_000_000 + now) % 2**29 + 2**30  # above those of PPO's training, below its evaluation's
+        rows = np.arange(first, min(first + envs.num_envs, count))  # the episodes of this round
+        actions = np.stack([random_actions(args, episode, steps, action_dim) for episode in rows])
+        seeds = (args.seed * 1_000_000 + rows) % 2**29 + 2**30  # above those of PPO's training, below its evaluation's
         obs, info = envs.reset(seed=np.resize(seeds, envs.num_envs).tolist())
         cue = info["cue"]  # at the start: in Rotate tasks it is what is left to turn
-        played = defaultdict(list, rgb=[obs["rgb"]], joints=[obs["joints"]], state=[info["state"]])
+        buffer = defaultdict(list, rgb=[obs["rgb"]], joints=[obs["joints"]], state=[info["state"]])
         for t in range(steps):
             obs, reward, _, _, info = envs.step(np.resize(actions[:, t], (envs.num_envs, action_dim)))
             for name, x in (*obs.items(), ("state", info["state"]), ("rewards", reward), ("success", info["success"])):
-                played[name].append(x)
-            bar.update(len(now))
-        played = {name: torch.stack([torch.as_tensor(x) for x in xs], 1) for name, xs in played.items()}
-        played |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue)}
+                buffer[name].append(x)
+            bar.update(len(rows))
+        buffer = {name: torch.stack([torch.as_tensor(x) for x in xs], 1) for name, xs in buffer.items()}
+        buffer |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue)}
         if not arrays:
-            if (size := played["rgb"][0].nbytes * count) > shutil.disk_usage(path.parent).free:
+            if (size := buffer["rgb"][0].nbytes * count) > shutil.disk_usage(path.parent).free:
                 fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free; lower --num-episodes")
             path.mkdir(exist_ok=True)
-            for name, x in played.items():
+            for name, x in buffer.items():
                 dtype, shape = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32), (count, *x.shape[1:])
                 arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, shape)
-        for name, x in played.items():
-            arrays[name][now] = x[: len(now)].cpu()
-        meta["episodes_done"] = int(now[-1]) + 1
+        for name, x in buffer.items():
+            arrays[name][rows] = x[: len(rows)].cpu()
+        meta["episodes_done"] = int(rows[-1]) + 1
         save(path / "meta.json", json.dumps(meta, indent=2).encode())
     bar.close()
     envs.close()
@@ -299,16 +313,17 @@ def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> 
 
 def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
-    num_val = round(args.num_episodes * args.val_share)
+    num_val = round(args.num_episodes * args.val_fraction)
     if not 4 <= num_val < args.num_episodes:  # stage 2 fits read-outs on half of them and tests them on the other
-        fail(f"--val-share {args.val_share} must hold out 4 or more of --num-episodes {args.num_episodes}, and not all")
+        fail(f"--val-fraction {args.val_fraction} of --num-episodes {args.num_episodes} must be 4 or more, and not all")
     check_task(args)
-    path, device = open_run(args), torch.device(args.device)
-    if (path / "repr.pt").exists():
-        print(f"{path / 'repr.pt'} is finished; --overwrite makes it anew")
+    path, device = check_run(args), torch.device(args.device)
+    if (path / "repr.pt").exists() and not args.overwrite:
+        print(f"{path / 'repr.pt'} is finished; --overwrite recreates it")
         return
+    open_run(path, args)
     dataset = path / "dataset"
-    arrays = collect(args, dataset)
+    arrays = collect_random_episodes(args, dataset)
     train = {name: x[:-num_val] for name, x in arrays.items()}
     steps, action_dim = arrays["actions"].shape[1:]
 
@@ -331,11 +346,11 @@ def main(args: Args) -> None:
     transitions, held_out = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
     per_epoch, first = math.ceil(len(transitions) / args.batch_size), 0
     if (path / "checkpoint.pt").exists():
-        checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint")
+        checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         first = checkpoint["epoch"]
-        print(f"going on with {path} at epoch {first}", flush=True)
+        print(f"resuming {path} at epoch {first}", flush=True)
     writer = SummaryWriter(path, purge_step=first * per_epoch + 1)
     bar = tqdm(total=args.epochs * per_epoch, initial=first * per_epoch, desc="phi", unit="update")
 
@@ -351,9 +366,9 @@ def main(args: Args) -> None:
             bar.update()
 
         with torch.no_grad():
-            some = read_transitions(dataset, held_out[:: len(held_out) // 1000 + 1], device)
-            val_losses = repr_losses(model, some, args)
-            active = (phi(some["state"]).mean.std(0) > 0.1).sum()
+            val_batch = read_transitions(dataset, held_out[:: len(held_out) // 1000 + 1], device)
+            val_losses = repr_losses(model, val_batch, args)
+            active = (phi(val_batch["state"]).mean.std(0) > 0.1).sum()
         update = (epoch + 1) * per_epoch
         writer.add_scalar("held_out/active_dimensions", active, update)  # of u: the others are silent
         for name, loss in losses.items():
@@ -372,11 +387,11 @@ def main(args: Args) -> None:
 # ---------------------------------------------------------------- simulator
 
 
-class TaskView(gym.Wrapper):
+class PrivilegedInfoWrapper(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and the task's other facts.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and what else the task hides.
     """
 
     def __init__(self, env: gym.Env):
@@ -391,13 +406,13 @@ class TaskView(gym.Wrapper):
             self.task.evaluate = evaluate
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
-    def _view(self, facts: dict, info: dict) -> tuple[dict, dict]:
+    def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
         rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
-        seen = {"agent": facts["agent"], "tcp_pose": facts["extra"].pop("tcp_pose")}
-        state = common.flatten_state_dict(facts["extra"], use_torch=True).float()
+        seen = {"agent": obs_dict["agent"], "tcp_pose": obs_dict["extra"].pop("tcp_pose")}
+        state = common.flatten_state_dict(obs_dict["extra"], use_torch=True).float()
         state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
         cue = self.task.oracle_info.float().reshape(len(state), -1)
         obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
@@ -407,13 +422,13 @@ class TaskView(gym.Wrapper):
         return self._view(*self.env.reset(**kwargs))
 
     def step(self, action: torch.Tensor) -> tuple:
-        facts, reward, terminated, truncated, info = self.env.step(action)
-        obs, info = self._view(facts, info)
+        obs_dict, reward, terminated, truncated, info = self.env.step(action)
+        obs, info = self._view(obs_dict, info)
         return obs, reward, terminated, truncated, info
 
 
 @contextmanager
-def light_shaders() -> Iterator[None]:
+def shaders_without_brdf_table() -> Iterator[None]:
     """Spare SAPIEN the table of a sky's reflections, most of a simulator's start on a CPU: there is no sky."""
     set_shader_dir = sapien.render.set_camera_shader_dir
     with tempfile.TemporaryDirectory() as folder:
@@ -427,7 +442,7 @@ def light_shaders() -> Iterator[None]:
         sapien.render.set_camera_shader_dir = set_shader_dir
 
 
-def lighten_meshes(task: gym.Env, triangles: int) -> None:
+def decimate_meshes(task: gym.Env, triangles: int) -> None:
     """Draw the robot with about so many triangles per mesh; everything else is drawn as it is.
 
     The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
@@ -443,44 +458,41 @@ def lighten_meshes(task: gym.Env, triangles: int) -> None:
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
                 arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))
-                light = sapien.render.RenderShapeTriangleMesh(*arrays, part.material)
-                light.local_pose = shape.local_pose
-                new.attach(light)
+                decimated = sapien.render.RenderShapeTriangleMesh(*arrays, part.material)
+                decimated.local_pose = shape.local_pose
+                new.attach(decimated)
         if old:
             entity.add_component(new)
             entity.remove_component(old)
 
 
 def flatten_ground(task: gym.Env) -> None:
-    """Draw the ground as two triangles between its corners instead of ManiSkill's 20,000: the same picture."""
+    """Draw the ground as two triangles instead of ManiSkill's 20,000 between 101 x 101 vertices: the same picture."""
     for entity in task.scene.actors["ground"]._objs:
         grid = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        (part,) = grid.render_shapes[0].parts
-        edge = np.abs(part.vertices[:, :2] - part.vertices[:, :2].mean(0))
-        corners = (edge == edge.max(0)).all(1)  # in the order (-, -), (-, +), (+, -), (+, +)
-        vertices, normals, uvs = (
-            part.vertices[corners],
-            part.get_vertex_normal()[corners],
-            part.get_vertex_uv()[corners],
-        )
-        plane, triangles = sapien.render.RenderBodyComponent(), np.array([[0, 2, 3], [0, 3, 1]])
-        plane.attach(sapien.render.RenderShapeTriangleMesh(vertices, triangles, normals, uvs, part.material))
+        part = grid.render_shapes[0].parts[0]
+        corners = [0, 100, -101, -1]
+        arrays = part.vertices[corners], [[0, 2, 3], [0, 3, 1]], part.get_vertex_normal()[corners]
+        plane = sapien.render.RenderBodyComponent()
+        plane.attach(sapien.render.RenderShapeTriangleMesh(*arrays, part.get_vertex_uv()[corners], part.material))
         entity.remove_component(grid)
         entity.add_component(plane)
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
+    if multiprocessing.parent_process():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
     modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
     backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
     modes["reconfiguration_freq"] = 0  # ShellGame tasks would build the scene, with stock meshes, at every reset
-    with light_shaders() if args.render_backend == "sapien_cpu" else nullcontext():
+    with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
         env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
-        if args.mesh_triangles:
-            lighten_meshes(env.unwrapped, args.mesh_triangles)
+        if args.robot_triangles:
+            decimate_meshes(env.unwrapped, args.robot_triangles)
             flatten_ground(env.unwrapped)
-        env = TaskView(env)
+        env = PrivilegedInfoWrapper(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
 
@@ -488,29 +500,26 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Build environments whose episodes all last max_episode_steps: actions in [-1, 1], no auto-reset.
 
     physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
-    forked from one that has done the imports, except where there is CUDA, which forbids it.
+    forked from one that has imported the tasks, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
-    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
-    multiprocessing.resource_tracker.ensure_running()  # its start would lift the block
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
-    multiprocessing.set_forkserver_preload([Path(__file__).stem])
+    multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     gym.logger.min_level = gym.logger.ERROR  # that a run is stopped in the middle of a step deserves no warning
     return envs
 
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
-    if args.mesh_triangles and args.sim_backend == "physx_cuda":
-        fail(f"meshes of {args.mesh_triangles} triangles need --sim-backend physx_cpu; 0 is for training on physx_cuda")
+    if args.robot_triangles and args.sim_backend == "physx_cuda":
+        fail(f"--robot-triangles {args.robot_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
-        fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")
+        nearest = difflib.get_close_matches(args.env_id, tasks) or sorted(tasks)
+        fail(f"--env-id {args.env_id} is no task of MIKASA-Robo; choose one of {', '.join(nearest)}")
     for asset in tasks[args.env_id].asset_download_ids or []:
         if not assets.is_data_source_downloaded(asset):
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")
@@ -531,45 +540,58 @@ def fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
-def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
+def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
-    settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
+    settings = TASKS.get(chosen.env_id, {})
+    if chosen.small:
+        settings = settings | SMALL
+    if chosen.quick:
+        settings = settings | QUICK
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
+    if args.small and args.quick:
+        fail("--small and --quick exclude each other; give one of them")
+    if "/" in args.exp_name:
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        least = 0 if isinstance(value, bool | float) else 1
-        least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
-        if isinstance(value, int | float) and not value >= least:
-            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
-        most = {"gamma": 1, "gae_lambda": 1, "noise_beta": 2}.get(name, math.inf)
-        if isinstance(value, int | float) and value > most:
-            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at most {most}")
+        low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
+        if isinstance(value, int | float) and not low <= value <= high:
+            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
+            fail(f"--{name.replace('_', '-')} {value} must be {bounds}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     return args
 
 
-def open_run(args: Args) -> Path:
-    """Create or re-open runs/{env_id}__{exp_name}__{seed}, for this process alone as long as it lives.
-
-    Fails when another process works there, or when what is there was made with other arguments.
-    """
+def check_run(args: Args) -> Path:
+    """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
+    if (path / "args.json").exists() and not args.overwrite:
+        recorded = json.loads((path / "args.json").read_text())
+        given = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
+        changed = [
+            f"{name}={recorded.get(name)} there, {x} here" for name, x in given.items() if recorded.get(name) != x
+        ]
+        if changed:
+            fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
+    return path
+
+
+def open_run(path: Path, args: Args) -> None:
+    """Make the run's directory, for this process alone as long as it lives, once all inputs have been read.
+
+    With --overwrite what it holds is deleted. Fails when another process works there.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
-    for file in path.iterdir() if args.overwrite else ():
-        shutil.rmtree(file) if file.is_dir() else file.unlink()
-    record, may_differ = path / "args.json", ("overwrite", "num_workers", "evaluate", "checkpoint")
-    here = {name: value for name, value in asdict(args).items() if name not in may_differ}
-    there = json.loads(record.read_text()) if record.exists() else here
-    differ = [f"{name}={there.get(name)} there, {x} here" for name, x in here.items() if there.get(name) != x]
-    if differ and any(file != record for file in path.iterdir()):
-        fail(f"{path} was made with other arguments ({'; '.join(differ)}); use --overwrite or another --exp-name")
-    save(record, json.dumps(here, indent=2).encode())
-    return path
+    if args.overwrite:
+        for file in path.iterdir():
+            shutil.rmtree(file) if file.is_dir() else file.unlink()
+    recorded = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
+    save(path / "args.json", json.dumps(recorded, indent=2).encode())
 
 
 def save(path: Path, content: dict | bytes) -> None:
@@ -585,11 +607,13 @@ def save(path: Path, content: dict | bytes) -> None:
 
 def load(path: Path, hint: str, **expected: object) -> dict:
     """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
+    if not path.exists():
+        fail(f"{path} does not exist")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         found = {name: content.get(name) for name in ("format", *expected)}
     except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
-        fail(f"{path} is missing, damaged or no file of these scripts ({type(error).__name__}); {hint}")
+        fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
     for name, value in {"format": FORMAT, **expected}.items():
         if found[name] != value:
             fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
@@ -598,6 +622,6 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 
 if __name__ == "__main__":
     try:
-        main(parse_args({}, SMALL, QUICK))
+        main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes from the last checkpoint")

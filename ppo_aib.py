@@ -10,10 +10,11 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, Tensor
 """
 
 import ctypes
+import difflib
 import fcntl
 import json
 import math
-import multiprocessing.resource_tracker
+import multiprocessing
 import os
 import shlex
 import shutil
@@ -71,7 +72,7 @@ class Args:
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, through which the policy does not see"""
-    mesh_triangles: int = 0 if CUDA else 500
+    robot_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU"""
@@ -80,7 +81,7 @@ class Args:
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
-    """delete what the run directory holds and start anew, every time it is given"""
+    """delete what the run directory holds and start again, every time it is given"""
 
     belief: str = "runs/{env_id}__aib_belief__{seed}/belief.pt"
     """belief of stage 2"""
@@ -88,12 +89,12 @@ class Args:
     """episodes of the random policy behind the belief; stage 1 collects them where they are missing"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
-    particle_noise: bool = True
+    sample_decoder: bool = True
     """draw each particle from the decoder's Gaussian; without it, take its mean"""
     total_timesteps: int = 10_000_000
     """environment steps of training"""
     num_envs: int = 256
-    """whole episodes per iteration; on physx_cuda one batch, with one arm pose"""
+    """episodes per iteration; on physx_cuda one batch, with one arm pose"""
     learning_rate: float = 1e-4
     """Adam's"""
     update_epochs: int = 2
@@ -125,11 +126,15 @@ class Args:
     amp: bool = False
     """image network in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint"""
+    """only evaluate --checkpoint, with the task, robot, sizes and precision that it was trained with"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
 
+# what an argument may be; elsewhere whole numbers from 1 and others from 0
+LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
+LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf))
+MAY_DIFFER = ("overwrite", "num_workers", "evaluate", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5, where it differs from the defaults above, which are InterceptFast's and InterceptMedium's
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
@@ -146,7 +151,9 @@ QUICK["belief"] = "runs/{env_id}__aib_belief_quick__{seed}/belief.pt"
 
 def mlp(sizes: list[int]) -> nn.Sequential:
     """Linear layers of the given sizes with ReLU between them."""
-    layers = [module for i, o in pairwise(sizes) for module in (nn.Linear(i, o), nn.ReLU())]
+    layers = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
 
@@ -178,8 +185,15 @@ class NatureCNN(nn.Module):
     def __init__(self, image_shape: list[int], size: int, amp: bool):
         super().__init__()
         self.amp = amp  # in bfloat16
-        convs = [nn.Conv2d(image_shape[-1], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)]
-        self.conv = nn.Sequential(*[module for conv in convs for module in (conv, nn.ReLU())], nn.Flatten())
+        self.conv = nn.Sequential(
+            nn.Conv2d(image_shape[-1], 32, 8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 3, stride=1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
         self.out = nn.Sequential(nn.Linear(flat, size), nn.ReLU())
 
@@ -224,10 +238,10 @@ class HistoryEncoder(nn.Module):
         x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
-    def forward(self, x: torch.Tensor, memory: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """x (T, B, .) of T steps that go on from memory, the GRU's state (None: start) -> h (T, B, 256), memory."""
-        output, memory = self.gru(x, memory)
-        return self.out(torch.cat([output, x], -1)), memory
+    def forward(self, x: torch.Tensor, hidden: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """x (T, B, .) of T steps that follow the GRU's state hidden (None: start) -> h (T, B, 256), hidden."""
+        output, hidden = self.gru(x, hidden)
+        return self.out(torch.cat([output, x], -1)), hidden
 
 
 class AIBBelief(nn.Module):
@@ -250,7 +264,7 @@ class AIBBelief(nn.Module):
         return self.decoder(torch.cat([z, h.unsqueeze(-2).expand(*z.shape[:-1], -1)], -1))
 
 
-class BeliefAgent(nn.Module):
+class Agent(nn.Module):
     """Actor and critic on image, joints and belief (paper 3.3): W(b) = W_agg(mean over particles of W_enc(u_i))."""
 
     def __init__(self, belief: nn.Module, joints_dim: int, action_dim: int, init_std: float, amp: bool = False):
@@ -266,23 +280,11 @@ class BeliefAgent(nn.Module):
         self.log_std = nn.Parameter(torch.full((action_dim,), math.log(init_std)))
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
-        """Policy over actions (B, A) and value (B,) of rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u)."""
+        """Distribution of actions (B, A), value (B,): rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u)."""
         belief = self.w_agg(self.w_enc(obs["particles"]).mean(-2))
         x = torch.cat([self.cnn(obs["rgb"].float().div_(255)), self.joints(obs["joints"]), belief], -1)
         mean = torch.tanh(self.actor(x))
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
-
-    def draw_particles(
-        self, obs: dict[str, torch.Tensor], memory: torch.Tensor | None, z_noise: torch.Tensor, u_noise: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Take in one observation (B, ...) and draw u_i ~ p(u|z_i,h), z_i ~ p(z|h): -> (B, n, u_dim), memory.
-
-        obs: rgb, joints; noise (B, n, .); memory: the history encoder's, None at the start of an episode.
-        """
-        x = self.belief.history.embed(obs["rgb"], obs["joints"])
-        h, memory = self.belief.history(x[None], memory)
-        decoded = self.belief.decode(h[0], z_noise)
-        return decoded.mean + decoded.stddev * u_noise, memory
 
 
 # ---------------------------------------------------------------- losses
@@ -299,14 +301,15 @@ def compute_gae(rewards: torch.Tensor, values: torch.Tensor, gamma: float, gae_l
 
 def ppo_losses(agent: nn.Module, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
     """PPO's clipped objective (Schulman et al., 2017) on a minibatch (B, ...), with advantages normalised in it."""
-    policy, value = agent(batch)
-    log_ratio = policy.log_prob(batch["action"]).sum(-1) - batch["logprob"]
+    dist, values = agent(batch)
+    log_ratio = dist.log_prob(batch["actions"]).sum(-1) - batch["logprobs"]
     ratio = log_ratio.exp()
-    advantage = (batch["advantage"] - batch["advantage"].mean()) / (batch["advantage"].std(correction=0) + 1e-8)
+    advantages = batch["advantages"]
+    advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
     clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
-    policy_loss = -torch.min(ratio * advantage, clipped * advantage).mean()
-    value_loss = 0.5 * (value - batch["return"]).square().mean()
-    entropy = policy.entropy().sum(-1).mean()
+    policy_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
+    value_loss = 0.5 * (values - batch["returns"]).square().mean()
+    entropy = dist.entropy().sum(-1).mean()
     return {
         "policy_loss": policy_loss,
         "value_loss": value_loss,
@@ -328,70 +331,77 @@ def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator)
 
 
 @torch.no_grad()
-def rollout_with_belief(
-    envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, seeds: np.ndarray, explore: bool = True
+def rollout(
+    envs: gym.vector.VectorEnv, agent: Agent, args: Args, seeds: np.ndarray, deterministic: bool = False
 ) -> dict[str, torch.Tensor]:
-    """Play one whole episode per seed; without explore, actions are the policy's means.
+    """Play one whole episode per seed; deterministic actions are the policy's means.
 
-    Returns arrays (T, N, ...): rgb uint8, joints, particles, action, logprob, reward, success; and value (T+1, N),
-    V(o_T) last. Without explore also the privileged state, for u_r2 alone. The particles are kept because fresh ones
-    would change the probability ratio of the update. Episodes are played in rounds of envs.num_envs; noise is drawn
-    before: on physx_cpu their size is no matter.
+    Returns arrays (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; and values (T+1, N),
+    V(o_T) last; if deterministic also the privileged state, which the evaluation compares the belief with.
+    The particles are kept because fresh ones would change the probability ratio of the update. Episodes are played in
+    rounds of envs.num_envs; all noise is drawn before, so that their size does not matter.
     """
-    steps, count, (action_dim,) = gym.spec(args.env_id).max_episode_steps, len(seeds), envs.single_action_space.shape
-    device, config, n = torch.device(args.device), agent.belief.config, args.num_particles
-    noise = colored_noise(args.noise_beta, (count, action_dim, steps), np.random.default_rng(seeds)) * explore
+    num_episodes, steps, device = len(seeds), gym.spec(args.env_id).max_episode_steps, torch.device(args.device)
+    (action_dim,) = envs.single_action_space.shape
+    noise = colored_noise(args.noise_beta, (num_episodes, action_dim, steps), np.random.default_rng(seeds))
     noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
-    z_noise = torch.randn(steps + 1, count, n, config["z_dim"], device=device)
-    u_noise = torch.randn(steps + 1, count, n, config["u_dim"], device=device) * args.particle_noise
-    data = {"value": torch.empty(steps + 1, count, device=device)}
-    bar = tqdm(total=steps * count, desc="rollout" if explore else "evaluation", unit="step", leave=False)
-    for first in range(0, count, envs.num_envs):
-        now = slice(first, min(first + envs.num_envs, count))  # the episodes of this round
-        playing = now.stop - now.start  # in the last round some environments may only repeat what others do
-        obs, info = envs.reset(seed=np.resize(seeds[now], envs.num_envs).tolist())
-        memory = None
+    particles, config = (steps + 1, num_episodes, args.num_particles), agent.belief.config
+    z_noise = torch.randn(*particles, config["z_dim"], device=device)
+    u_noise = torch.randn(*particles, config["u_dim"], device=device)
+    if not args.sample_decoder:
+        u_noise.zero_()
+    buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
+    name = "evaluation" if deterministic else "rollout"
+    bar = tqdm(total=steps * num_episodes, desc=name, unit="step", leave=False)
+    for first in range(0, num_episodes, envs.num_envs):
+        rows = slice(first, min(first + envs.num_envs, num_episodes))  # the episodes of this round
+        num_active = rows.stop - rows.start  # in the last round the other environments only repeat what these do
+        obs, info = envs.reset(seed=np.resize(seeds[rows], envs.num_envs).tolist())
+        hidden = None
         for t in range(steps + 1):
-            step = {name: torch.as_tensor(obs[name][:playing], device=device) for name in ("rgb", "joints")}
-            if not explore:
-                step["state"] = torch.as_tensor(info["state"][:playing], device=device)
-            step["particles"], memory = agent.draw_particles(step, memory, z_noise[t, now], u_noise[t, now])
-            policy, data["value"][t, now] = agent(step)
+            step = {name: torch.as_tensor(obs[name][:num_active], device=device) for name in ("rgb", "joints")}
+            x = agent.belief.history.embed(step["rgb"], step["joints"])
+            h, hidden = agent.belief.history(x[None], hidden)
+            u = agent.belief.decode(h[0], z_noise[t, rows])
+            step["particles"] = u.mean + u.stddev * u_noise[t, rows]
+            dist, buffer["values"][t, rows] = agent(step)
             if t == steps:
                 break  # the last observation is only for its value
-            step["action"] = policy.mean + policy.stddev * noise[t, now]
-            step["logprob"] = policy.log_prob(step["action"]).sum(-1)
-            action = step["action"].clamp(-1, 1).cpu().numpy()
-            obs, reward, _, _, info = envs.step(np.resize(action, (envs.num_envs, action_dim)))
-            for name, x in (("reward", reward), ("success", info["success"])):
-                step[name] = torch.as_tensor(x[:playing], dtype=torch.float32, device=device)
+            step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
+            step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
+            if deterministic:
+                step["state"] = torch.as_tensor(info["state"][:num_active], device=device)
+            actions = step["actions"].clamp(-1, 1).cpu().numpy()
+            obs, rewards, _, _, info = envs.step(np.resize(actions, (envs.num_envs, action_dim)))
+            step["rewards"] = torch.as_tensor(rewards[:num_active], dtype=torch.float32, device=device)
+            step["success"] = torch.as_tensor(info["success"][:num_active], dtype=torch.float32, device=device)
             for name, x in step.items():
-                if name not in data:
-                    data[name] = torch.empty(steps, count, *x.shape[1:], dtype=x.dtype, device=device)
-                data[name][t, now] = x
-            bar.update(playing)
+                if name not in buffer:
+                    buffer[name] = torch.empty(steps, num_episodes, *x.shape[1:], dtype=x.dtype, device=device)
+                buffer[name][t, rows] = x
+            bar.update(num_active)
     bar.close()
-    return data
+    return buffer
 
 
 # ---------------------------------------------------------------- evaluation
 
 
-def success_and_return(data: dict[str, torch.Tensor]) -> dict[str, float]:
+def success_and_return(buffer: dict[str, torch.Tensor]) -> dict[str, float]:
     """success_once, success_at_end (paper, appendix A) and return of a rollout, means over its episodes."""
     return {
-        "success_once": data["success"].amax(0).mean().item(),
-        "success_at_end": data["success"][-1].mean().item(),
-        "return": data["reward"].sum(0).mean().item(),
+        "success_once": buffer["success"].amax(0).mean().item(),
+        "success_at_end": buffer["success"][-1].mean().item(),
+        "return": buffer["rewards"].sum(0).mean().item(),
     }
 
 
-def make_video(data: dict[str, torch.Tensor]) -> bytes:
+def make_video(buffer: dict[str, torch.Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green frame marks success."""
-    rgb = data["rgb"][:, :4].cpu().numpy().repeat(2, 2).repeat(2, 3)
+    rgb = buffer["rgb"][:, :4].cpu().numpy().repeat(2, 2).repeat(2, 3)
     edge = np.ones(rgb.shape[2:4], bool)
     edge[6:-6, 6:-6] = False
-    succeeded = data["success"][:-1, :4].cpu().numpy() > 0.5  # after step t: what frame t + 1 shows
+    succeeded = buffer["success"][:-1, :4].cpu().numpy() > 0.5  # after step t: what frame t + 1 shows
     rgb[1:][succeeded[:, :, None, None] & edge] = (0, 255, 0)
     rgb = np.concatenate(list(rgb.swapaxes(0, 1)), axis=2)
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1)
@@ -403,21 +413,19 @@ def r_squared(u: torch.Tensor, estimate: torch.Tensor) -> float:
 
 
 @torch.no_grad()
-def evaluate_with_belief(
-    envs: gym.vector.VectorEnv, agent: BeliefAgent, args: Args, phi: StateEncoder
-) -> tuple[dict[str, float], bytes]:
+def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args, phi: StateEncoder) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
     u_r2, u_r2_at_end: what the belief knows where its agent takes it, R2 of u = phi(s) from the mean particle, over all
     steps and at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
     """
     torch.manual_seed(0)
-    data = rollout_with_belief(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), explore=False)
-    u, estimate = phi(data["state"]).mean, data["particles"].mean(-2)
-    metrics = success_and_return(data)
+    buffer = rollout(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), deterministic=True)
+    u, estimate = phi(buffer["state"]).mean, buffer["particles"].mean(-2)
+    metrics = success_and_return(buffer)
     metrics["u_r2"] = r_squared(u.flatten(0, 1), estimate.flatten(0, 1))
     metrics["u_r2_at_end"] = r_squared(u[-1], estimate[-1])
-    return metrics, make_video(data)
+    return metrics, make_video(buffer)
 
 
 # ---------------------------------------------------------------- training
@@ -427,17 +435,17 @@ def evaluate_checkpoint(args: Args) -> None:
     """Evaluate the agent of --checkpoint, on the task it was trained on; writes evaluation.json and .mp4 beside it."""
     file = Path(args.checkpoint.format(**vars(args)))
     stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
-    for name in ("env_id", "robot", "mesh_triangles", "num_envs", "amp", "num_particles", "particle_noise"):
+    for name in ("env_id", "robot", "robot_triangles", "num_envs", "amp", "num_particles", "sample_decoder"):
         setattr(args, name, stored[name])
     check_task(args)
     envs, device = make_envs(args), torch.device(args.device)
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     belief = AIBBelief(stored["config"], args.amp)
-    agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
+    agent = Agent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"]).to(device)
     phi.load_state_dict(stored["phi"])
     agent.load_state_dict(stored["agent"])
-    metrics, video = evaluate_with_belief(envs, agent, args, phi)
+    metrics, video = evaluate(envs, agent, args, phi)
     save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
     save(file.with_name("evaluation.mp4"), video)
     print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
@@ -449,27 +457,28 @@ def main(args: Args) -> None:
     check_task(args)
     per_iteration = gym.spec(args.env_id).max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // per_iteration)
-    path = open_run(args)
-    resume = (path / "checkpoint.pt").exists()
-    checkpoint = load(path / "checkpoint.pt", "start anew with --overwrite", kind="checkpoint") if resume else {}
+    path = check_run(args)
+    resume = (path / "checkpoint.pt").exists() and not args.overwrite
+    checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
     if checkpoint.get("iteration") == num_iterations:
-        print(f"{path} is finished; --overwrite makes it anew")
+        print(f"{path} is finished; --overwrite recreates it")
         return
     file, size = Path(args.belief.format(**vars(args))), QUICK if args.quick else SMALL if args.small else {}
     if not file.exists() and args.belief == size.get("belief", Args.belief):
         run_stage("aib_belief.py", args)
-    hint = "give here what it was made with (--num-episodes, ...) or make it anew with aib_belief.py --overwrite"
-    task = {name: getattr(args, name) for name in ("env_id", "robot", "mesh_triangles", "num_episodes")}
+    hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_belief.py --overwrite"
+    task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "num_episodes")}
     stored = load(file, hint, kind="aib_belief", **task)
     begun = checkpoint.get("agent", {})
     if any(not torch.equal(begun.get(f"belief.{name}", x), x) for name, x in stored["belief"].items()):
         fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
+    open_run(path, args)
 
     envs, device = make_envs(args), torch.device(args.device)
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     torch.manual_seed(args.seed)
     belief = AIBBelief(stored["config"], args.amp)
-    agent = BeliefAgent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
+    agent = Agent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"]).to(device)
     phi.load_state_dict(stored["phi"])
     agent.belief.load_state_dict(stored["belief"])
@@ -478,7 +487,7 @@ def main(args: Args) -> None:
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        print(f"going on with {path} at step {first * per_iteration:,}", flush=True)
+        print(f"resuming {path} at step {first * per_iteration:,}", flush=True)
     writer = SummaryWriter(path, purge_step=first * per_iteration + 1)
     bar = tqdm(total=num_iterations * per_iteration, initial=first * per_iteration, desc="PPO", unit="step")
 
@@ -486,30 +495,38 @@ def main(args: Args) -> None:
         start, global_step = time.time(), iteration * per_iteration
         torch.manual_seed(args.seed * 1_000_000 + iteration)  # so that a resumed run repeats the iteration
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
-        data = rollout_with_belief(envs, agent, args, seeds)
-        scalars = {f"train/{name}": value for name, value in success_and_return(data).items()}
+        buffer = rollout(envs, agent, args, seeds)
+        scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
+        scalars["charts/episodic_return"] = scalars["train/return"]
         scalars["time/rollout"] = time.time() - start
 
-        values = data.pop("value")
-        data["advantage"] = compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
-        data["return"] = data["advantage"] + values[:-1]
-        batch = {name: x.flatten(0, 1) for name, x in data.items()}
-        orders = [torch.randperm(per_iteration, device=device) for _ in range(args.update_epochs)]
-        for index in [part for order in orders for part in order.tensor_split(args.num_minibatches)]:
-            losses = ppo_losses(agent, {name: x[index] for name, x in batch.items()}, args)
+        values = buffer.pop("values")
+        buffer["advantages"] = compute_gae(buffer["rewards"], values, args.gamma, args.gae_lambda)
+        buffer["returns"] = buffer["advantages"] + values[:-1]
+        batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
+        stepped = []  # the losses of the minibatches that were stepped on
+        for _ in range(args.update_epochs):
+            for mb_inds in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
+                losses = ppo_losses(agent, {name: x[mb_inds] for name, x in batch.items()}, args)
+                if losses["approx_kl"] > args.target_kl:
+                    break
+                optimizer.zero_grad()
+                losses["total"].backward()
+                nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
+                optimizer.step()
+                stepped.append({name: x.detach() for name, x in losses.items()})
             if losses["approx_kl"] > args.target_kl:
                 break
-            optimizer.zero_grad()
-            losses["total"].backward()
-            nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
-            optimizer.step()
-        scalars |= {f"losses/{name}": value.item() for name, value in losses.items()}
+        for name in losses:
+            scalars[f"losses/{name}"] = torch.stack([minibatch[name] for minibatch in stepped]).mean().item()
+        explained = 1 - batch["advantages"].var() / batch["returns"].var()
+        scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(stepped)}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
-        del data, batch, losses  # a gigabyte of images and a graph: not two at a time
+        del buffer, batch, losses  # a gigabyte of images and a graph: not two at a time
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
-            metrics, video = evaluate_with_belief(envs, agent, args, phi)
+            metrics, video = evaluate(envs, agent, args, phi)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
             lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
@@ -536,11 +553,11 @@ def main(args: Args) -> None:
 # ---------------------------------------------------------------- simulator
 
 
-class TaskView(gym.Wrapper):
+class PrivilegedInfoWrapper(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and the task's other facts.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and what else the task hides.
     """
 
     def __init__(self, env: gym.Env):
@@ -555,13 +572,13 @@ class TaskView(gym.Wrapper):
             self.task.evaluate = evaluate
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
-    def _view(self, facts: dict, info: dict) -> tuple[dict, dict]:
+    def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
         rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
-        seen = {"agent": facts["agent"], "tcp_pose": facts["extra"].pop("tcp_pose")}
-        state = common.flatten_state_dict(facts["extra"], use_torch=True).float()
+        seen = {"agent": obs_dict["agent"], "tcp_pose": obs_dict["extra"].pop("tcp_pose")}
+        state = common.flatten_state_dict(obs_dict["extra"], use_torch=True).float()
         state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
         cue = self.task.oracle_info.float().reshape(len(state), -1)
         obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
@@ -571,13 +588,13 @@ class TaskView(gym.Wrapper):
         return self._view(*self.env.reset(**kwargs))
 
     def step(self, action: torch.Tensor) -> tuple:
-        facts, reward, terminated, truncated, info = self.env.step(action)
-        obs, info = self._view(facts, info)
+        obs_dict, reward, terminated, truncated, info = self.env.step(action)
+        obs, info = self._view(obs_dict, info)
         return obs, reward, terminated, truncated, info
 
 
 @contextmanager
-def light_shaders() -> Iterator[None]:
+def shaders_without_brdf_table() -> Iterator[None]:
     """Spare SAPIEN the table of a sky's reflections, most of a simulator's start on a CPU: there is no sky."""
     set_shader_dir = sapien.render.set_camera_shader_dir
     with tempfile.TemporaryDirectory() as folder:
@@ -591,7 +608,7 @@ def light_shaders() -> Iterator[None]:
         sapien.render.set_camera_shader_dir = set_shader_dir
 
 
-def lighten_meshes(task: gym.Env, triangles: int) -> None:
+def decimate_meshes(task: gym.Env, triangles: int) -> None:
     """Draw the robot with about so many triangles per mesh; everything else is drawn as it is.
 
     The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
@@ -607,44 +624,41 @@ def lighten_meshes(task: gym.Env, triangles: int) -> None:
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
                 arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))
-                light = sapien.render.RenderShapeTriangleMesh(*arrays, part.material)
-                light.local_pose = shape.local_pose
-                new.attach(light)
+                decimated = sapien.render.RenderShapeTriangleMesh(*arrays, part.material)
+                decimated.local_pose = shape.local_pose
+                new.attach(decimated)
         if old:
             entity.add_component(new)
             entity.remove_component(old)
 
 
 def flatten_ground(task: gym.Env) -> None:
-    """Draw the ground as two triangles between its corners instead of ManiSkill's 20,000: the same picture."""
+    """Draw the ground as two triangles instead of ManiSkill's 20,000 between 101 x 101 vertices: the same picture."""
     for entity in task.scene.actors["ground"]._objs:
         grid = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        (part,) = grid.render_shapes[0].parts
-        edge = np.abs(part.vertices[:, :2] - part.vertices[:, :2].mean(0))
-        corners = (edge == edge.max(0)).all(1)  # in the order (-, -), (-, +), (+, -), (+, +)
-        vertices, normals, uvs = (
-            part.vertices[corners],
-            part.get_vertex_normal()[corners],
-            part.get_vertex_uv()[corners],
-        )
-        plane, triangles = sapien.render.RenderBodyComponent(), np.array([[0, 2, 3], [0, 3, 1]])
-        plane.attach(sapien.render.RenderShapeTriangleMesh(vertices, triangles, normals, uvs, part.material))
+        part = grid.render_shapes[0].parts[0]
+        corners = [0, 100, -101, -1]
+        arrays = part.vertices[corners], [[0, 2, 3], [0, 3, 1]], part.get_vertex_normal()[corners]
+        plane = sapien.render.RenderBodyComponent()
+        plane.attach(sapien.render.RenderShapeTriangleMesh(*arrays, part.get_vertex_uv()[corners], part.material))
         entity.remove_component(grid)
         entity.add_component(plane)
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
+    if multiprocessing.parent_process():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
     modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
     backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
     modes["reconfiguration_freq"] = 0  # ShellGame tasks would build the scene, with stock meshes, at every reset
-    with light_shaders() if args.render_backend == "sapien_cpu" else nullcontext():
+    with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
         env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
-        if args.mesh_triangles:
-            lighten_meshes(env.unwrapped, args.mesh_triangles)
+        if args.robot_triangles:
+            decimate_meshes(env.unwrapped, args.robot_triangles)
             flatten_ground(env.unwrapped)
-        env = TaskView(env)
+        env = PrivilegedInfoWrapper(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
 
@@ -652,29 +666,26 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Build environments whose episodes all last max_episode_steps: actions in [-1, 1], no auto-reset.
 
     physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
-    forked from one that has done the imports, except where there is CUDA, which forbids it.
+    forked from one that has imported the tasks, except where there is CUDA, which forbids it.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
-    os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # where the process they are forked from finds this file
-    multiprocessing.resource_tracker.ensure_running()  # its start would lift the block
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers inherit it: Ctrl-C ends the main process only
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
-    multiprocessing.set_forkserver_preload([Path(__file__).stem])
+    multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     gym.logger.min_level = gym.logger.ERROR  # that a run is stopped in the middle of a step deserves no warning
     return envs
 
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
-    if args.mesh_triangles and args.sim_backend == "physx_cuda":
-        fail(f"meshes of {args.mesh_triangles} triangles need --sim-backend physx_cpu; 0 is for training on physx_cuda")
+    if args.robot_triangles and args.sim_backend == "physx_cuda":
+        fail(f"--robot-triangles {args.robot_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
-        fail(f"unknown task --env-id {args.env_id}; choose one of {', '.join(sorted(tasks))}")
+        nearest = difflib.get_close_matches(args.env_id, tasks) or sorted(tasks)
+        fail(f"--env-id {args.env_id} is no task of MIKASA-Robo; choose one of {', '.join(nearest)}")
     for asset in tasks[args.env_id].asset_download_ids or []:
         if not assets.is_data_source_downloaded(asset):
             fail(f"{args.env_id} needs an asset; fetch it with: python -m mani_skill.utils.download_asset {asset}")
@@ -695,45 +706,58 @@ def fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
-def parse_args(tasks: dict[str, dict], small: dict, quick: dict) -> Args:
+def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
-    settings = tasks.get(chosen.env_id, {}) | (small if chosen.small else {}) | (quick if chosen.quick else {})
+    settings = TASKS.get(chosen.env_id, {})
+    if chosen.small:
+        settings = settings | SMALL
+    if chosen.quick:
+        settings = settings | QUICK
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
+    if args.small and args.quick:
+        fail("--small and --quick exclude each other; give one of them")
+    if "/" in args.exp_name:
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        least = 0 if isinstance(value, bool | float) else 1
-        least = {"seed": 0, "mesh_triangles": 0, "image_shift": 0, "init_std": 0.001}.get(name, least)
-        if isinstance(value, int | float) and not value >= least:
-            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at least {least}")
-        most = {"gamma": 1, "gae_lambda": 1, "noise_beta": 2}.get(name, math.inf)
-        if isinstance(value, int | float) and value > most:
-            fail(f"--{name.replace('_', '-')} {value} makes no sense; it must be at most {most}")
+        low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
+        if isinstance(value, int | float) and not low <= value <= high:
+            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
+            fail(f"--{name.replace('_', '-')} {value} must be {bounds}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     return args
 
 
-def open_run(args: Args) -> Path:
-    """Create or re-open runs/{env_id}__{exp_name}__{seed}, for this process alone as long as it lives.
-
-    Fails when another process works there, or when what is there was made with other arguments.
-    """
+def check_run(args: Args) -> Path:
+    """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
+    if (path / "args.json").exists() and not args.overwrite:
+        recorded = json.loads((path / "args.json").read_text())
+        given = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
+        changed = [
+            f"{name}={recorded.get(name)} there, {x} here" for name, x in given.items() if recorded.get(name) != x
+        ]
+        if changed:
+            fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
+    return path
+
+
+def open_run(path: Path, args: Args) -> None:
+    """Make the run's directory, for this process alone as long as it lives, once all inputs have been read.
+
+    With --overwrite what it holds is deleted. Fails when another process works there.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
-    for file in path.iterdir() if args.overwrite else ():
-        shutil.rmtree(file) if file.is_dir() else file.unlink()
-    record, may_differ = path / "args.json", ("overwrite", "num_workers", "evaluate", "checkpoint")
-    here = {name: value for name, value in asdict(args).items() if name not in may_differ}
-    there = json.loads(record.read_text()) if record.exists() else here
-    differ = [f"{name}={there.get(name)} there, {x} here" for name, x in here.items() if there.get(name) != x]
-    if differ and any(file != record for file in path.iterdir()):
-        fail(f"{path} was made with other arguments ({'; '.join(differ)}); use --overwrite or another --exp-name")
-    save(record, json.dumps(here, indent=2).encode())
-    return path
+    if args.overwrite:
+        for file in path.iterdir():
+            shutil.rmtree(file) if file.is_dir() else file.unlink()
+    recorded = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
+    save(path / "args.json", json.dumps(recorded, indent=2).encode())
 
 
 def save(path: Path, content: dict | bytes) -> None:
@@ -749,11 +773,13 @@ def save(path: Path, content: dict | bytes) -> None:
 
 def load(path: Path, hint: str, **expected: object) -> dict:
     """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
+    if not path.exists():
+        fail(f"{path} does not exist")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         found = {name: content.get(name) for name in ("format", *expected)}
     except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
-        fail(f"{path} is missing, damaged or no file of these scripts ({type(error).__name__}); {hint}")
+        fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
     for name, value in {"format": FORMAT, **expected}.items():
         if found[name] != value:
             fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
@@ -763,25 +789,30 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 def run_stage(script: str, args: Args) -> None:
     """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
     command = [sys.executable, str(Path(__file__).with_name(script))]
-    command += ["--small"] * args.small + ["--quick"] * args.quick
-    task = ("env_id", "seed", "robot", "mesh_triangles", "num_episodes")
+    if args.small:
+        command.append("--small")
+    if args.quick:
+        command.append("--quick")
+    task = ("env_id", "seed", "robot", "robot_triangles", "num_episodes")
     for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
-    libc = ctypes.CDLL(None)  # its prctl(PR_SET_PDEATHSIG = 1): the stage ends when this process is killed
-    child = subprocess.Popen(command, start_new_session=True, preexec_fn=lambda: libc.prctl(1, signal.SIGTERM))
-    handler = signal.signal(signal.SIGINT, lambda *_: child.send_signal(signal.SIGINT))  # Ctrl-C is handed on to it
-    if child.wait():
-        sys.exit(child.returncode)
-    signal.signal(signal.SIGINT, handler)
+    # prctl(PR_SET_PDEATHSIG, SIGKILL): the stage ends when this process is killed
+    stage = subprocess.Popen(command, preexec_fn=lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL))
+    try:
+        stage.wait()
+    except KeyboardInterrupt:
+        stage.wait()  # Ctrl-C reaches the stage, too, and the stage says so
+    if stage.returncode:
+        sys.exit(stage.returncode)
 
 
 if __name__ == "__main__":
     try:
-        args = parse_args(TASKS, SMALL, QUICK)
+        args = parse_args()
         if args.evaluate:
             evaluate_checkpoint(args)
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, goes on from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes from the last checkpoint")

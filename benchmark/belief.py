@@ -41,11 +41,12 @@ BELIEVER = """
 import json, sys
 import numpy as np, torch
 import aib_belief, ppo_believer as b
-args = b.parse_args({}, b.SMALL, {})
-path = b.open_run(args)
-if not (path / "belief.pt").exists():
-    b.train_belief(args, path)
+args = b.parse_args()
+path = b.check_run(args)
 episodes, stored = b.load_episodes(args)
+b.open_run(path, args)
+if not (path / "belief.pt").exists():
+    b.train_belief(args, path, episodes, stored)
 belief = b.BelieverBelief(b.load(path / "belief.pt", "")["config"])
 belief.prior = lambda h: torch.distributions.Normal(torch.zeros(*h.shape[:-1], args.z_dim), 1.0)
 posterior = b.GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
@@ -54,7 +55,7 @@ model.load_state_dict(b.load(path / "belief_checkpoint.pt", "")["model"])
 held_out = np.arange(args.num_episodes)[-stored["num_val"]:]
 halves = np.split(held_out, [len(held_out) - len(held_out) // 2])  # as in aib_belief.main
 fit, test = (aib_belief.encode(model.to(args.device)["belief"], posterior, episodes, half) for half in halves)
-b.save(path / "diagnostics.json", json.dumps(aib_belief.diagnose_belief(fit, test), indent=2).encode())
+b.save(path / "diagnostics.json", json.dumps(aib_belief.probe_belief(fit, test), indent=2).encode())
 """
 
 

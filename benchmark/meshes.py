@@ -39,11 +39,11 @@ def run(*command: str) -> None:
 def main(args: Args) -> None:
     """Run what is missing and print the read-outs."""
     task, runs = ["--env-id", args.env_id, "--sim-backend", "physx_cpu"], Path("runs")
-    run("aib_belief.py", *task, "--small", "--mesh-triangles", "500")
+    run("aib_belief.py", *task, "--small", "--robot-triangles", "500")
     repr_dir = runs / f"{args.env_id}__aib_repr_small__1"
     for triangles in (500, 0):
-        test = ["--num-episodes", str(args.num_test), "--epochs", "1", "--seed", "2", "--val-share", "0.5"]
-        run("aib_repr.py", *task, *test, "--mesh-triangles", str(triangles), "--exp-name", f"meshes_test_{triangles}")
+        test = ["--num-episodes", str(args.num_test), "--epochs", "1", "--seed", "2", "--val-fraction", "0.5"]
+        run("aib_repr.py", *task, *test, "--robot-triangles", str(triangles), "--exp-name", f"meshes_test_{triangles}")
 
     stored = torch.load(runs / f"{args.env_id}__aib_belief_small__1" / "belief.pt", weights_only=True)
     stored_repr = torch.load(repr_dir / "repr.pt", weights_only=True)
@@ -58,7 +58,7 @@ def main(args: Args) -> None:
         """aib_belief.encode of the last episodes of a dataset."""
         state = torch.from_numpy(np.load(path / "dataset" / "state.npy"))
         with torch.no_grad():
-            episodes = aib_belief.Episodes(path / "dataset", phi(state).mean, torch.device("cpu"))
+            episodes = aib_belief.EpisodeDataset(path / "dataset", phi(state).mean, torch.device("cpu"))
         return aib_belief.encode(belief, posterior, episodes, np.arange(len(state))[-count:])
 
     fit = encode(repr_dir, stored_repr["num_val"])
@@ -66,7 +66,7 @@ def main(args: Args) -> None:
     for name, triangles in (("light", 500), ("stock", 0)):
         test = encode(runs / f"{args.env_id}__meshes_test_{triangles}__2", args.num_test)
         pairs = zip(fit["particle"].unbind(1), test["particle"].unbind(1), strict=True)
-        scores = [aib_belief.readout_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in pairs]
+        scores = [aib_belief.probe_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in pairs]
         report[name] = {"last step": scores[-1], "mean over steps": float(np.mean(scores))}
     print(json.dumps(report, indent=2))
 

@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import ppo_aib  # noqa: E402
 import ppo_believer  # noqa: E402
 from aib_belief import StateEncoder  # noqa: E402
-from ppo_aib import BeliefAgent, fail, load  # noqa: E402
+from ppo_aib import Agent, fail, load  # noqa: E402
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Args:
 
 @torch.no_grad()
 def play(
-    envs: gym.vector.VectorEnv, agent: BeliefAgent, settings: ppo_aib.Args, seeds: np.ndarray
+    envs: gym.vector.VectorEnv, agent: Agent, settings: ppo_aib.Args, seeds: np.ndarray
 ) -> dict[str, torch.Tensor]:
     """One episode per seed (E,), E at most envs.num_envs, with actions drawn from the policy; what stage 1 keeps of it.
 
@@ -58,11 +58,13 @@ def play(
     """
     device, config, count = agent.log_std.device, agent.belief.config, envs.num_envs
     obs, info = envs.reset(seed=np.resize(seeds, count).tolist())
-    cue, memory, played = info["cue"], None, defaultdict(list)
+    cue, hidden, played = info["cue"], None, defaultdict(list)
     for t in range((steps := gym.spec(settings.env_id).max_episode_steps) + 1):
         step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
         noise = [torch.randn(count, settings.num_particles, config[name], device=device) for name in ("z_dim", "u_dim")]
-        step["particles"], memory = agent.draw_particles(step, memory, *noise)
+        h, hidden = agent.belief.history(agent.belief.history.embed(step["rgb"], step["joints"])[None], hidden)
+        u = agent.belief.decode(h[0], noise[0])
+        step["particles"] = u.mean + u.stddev * noise[1]
         seen = {"rgb": obs["rgb"], "joints": obs["joints"], "state": info["state"]}
         seen["particle"] = step["particles"].mean(-2)
         if t < steps:
@@ -83,10 +85,10 @@ def main(args: Args) -> None:
     if stored.get("kind") not in beliefs:
         fail(f"{args.agent} is a file of another kind ({stored.get('kind')}); {hint}")
     settings = ppo_aib.Args(num_workers=args.num_workers)  # devices of this machine, the rest as the agent was trained
-    for name in ("env_id", "seed", "robot", "mesh_triangles", "num_envs", "init_std", "amp", "num_particles"):
+    for name in ("env_id", "seed", "robot", "robot_triangles", "num_envs", "init_std", "amp", "num_particles"):
         setattr(settings, name, stored[name])
     source = Path(args.repr_dir.format(**vars(settings)))
-    task = {name: stored[name] for name in ("env_id", "robot", "mesh_triangles")}
+    task = {name: stored[name] for name in ("env_id", "robot", "robot_triangles")}
     encoder = load(source / "repr.pt", "name its run of aib_repr.py with --repr-dir", kind="repr", **task)
     if "refreshed_by" in encoder:
         fail(f"{source} is a refreshed dataset; name the run of aib_repr.py that it was made from with --repr-dir")
@@ -101,7 +103,7 @@ def main(args: Args) -> None:
     envs, device = ppo_aib.make_envs(settings), torch.device(settings.device)
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     belief = beliefs[stored["kind"]](stored["config"], settings.amp)
-    agent = BeliefAgent(belief, joints_dim, action_dim, settings.init_std, settings.amp).to(device)
+    agent = Agent(belief, joints_dim, action_dim, settings.init_std, settings.amp).to(device)
     agent.load_state_dict(stored["agent"])
     phi = StateEncoder(len(encoder["phi"]["mean"]), encoder["u_dim"])
     phi.load_state_dict(encoder["phi"])
@@ -123,7 +125,7 @@ def main(args: Args) -> None:
     torch.manual_seed(settings.seed)
     bar = tqdm(total=len(rows), desc="the agent's episodes", unit="episode")
     for now in np.array_split(rows, math.ceil(len(rows) / envs.num_envs)):
-        seeds = (settings.seed * 1_000_000 + scenes[now]) % 2**29 + 2**30  # as in aib_repr.collect
+        seeds = (settings.seed * 1_000_000 + scenes[now]) % 2**29 + 2**30  # as in aib_repr.collect_random_episodes
         episodes = play(envs, agent, settings, seeds)
         for name, x in arrays.items():
             x[now] = episodes[name]

@@ -93,9 +93,9 @@ def mikasa(envs: object, steps: int, seeds: np.ndarray) -> tuple[torch.nn.Module
     )
     start = time.perf_counter()
     buffers = DictArray((steps, len(seeds)), space, device=device)
-    data = {name: torch.zeros(steps, len(seeds)) for name in ("logprob", "reward")}
-    data["action"] = torch.zeros(steps, len(seeds), *envs.single_action_space.shape)
-    data["value"] = torch.zeros(steps + 1, len(seeds))
+    data = {name: torch.zeros(steps, len(seeds)) for name in ("logprobs", "rewards")}
+    data["actions"] = torch.zeros(steps, len(seeds), *envs.single_action_space.shape)
+    data["values"] = torch.zeros(steps + 1, len(seeds))
     with torch.no_grad():
         for first in range(0, len(seeds), envs.num_envs):
             now = slice(first, first + envs.num_envs)
@@ -103,12 +103,12 @@ def mikasa(envs: object, steps: int, seeds: np.ndarray) -> tuple[torch.nn.Module
             for t in range(steps + 1):
                 seen = {"rgb": torch.as_tensor(obs["rgb"]), "state": torch.as_tensor(obs["joints"])}
                 action, logprob, _, value = agent.get_action_and_value(seen)
-                data["value"][t, now] = value.flatten()
+                data["values"][t, now] = value.flatten()
                 if t < steps:
                     buffers[t, now] = seen
-                    data["action"][t, now], data["logprob"][t, now] = action, logprob
+                    data["actions"][t, now], data["logprobs"][t, now] = action, logprob
                     obs, reward, _, _, _ = envs.step(action.clamp(-1, 1).numpy())
-                    data["reward"][t, now] = torch.as_tensor(reward, dtype=torch.float32)
+                    data["rewards"][t, now] = torch.as_tensor(reward, dtype=torch.float32)
     data |= {"rgb": buffers["rgb"], "joints": buffers["state"]}
     return MikasaAgent(agent), data, time.perf_counter() - start
 
@@ -116,10 +116,10 @@ def mikasa(envs: object, steps: int, seeds: np.ndarray) -> tuple[torch.nn.Module
 def update(agent: torch.nn.Module, data: dict, args: ppo_baseline.Args) -> float:
     """Seconds of one PPO update on a rollout, as in ppo_baseline.main."""
     optimizer = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5, fused=True)
-    start, values = time.perf_counter(), data["value"]
-    advantage = ppo_baseline.compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
-    data = {**data, "advantage": advantage, "return": advantage + values[:-1]}
-    batch = {name: x.flatten(0, 1) for name, x in data.items() if name != "value"}
+    start, values = time.perf_counter(), data["values"]
+    advantage = ppo_baseline.compute_gae(data["rewards"], values, args.gamma, args.gae_lambda)
+    data = {**data, "advantages": advantage, "returns": advantage + values[:-1]}
+    batch = {name: x.flatten(0, 1) for name, x in data.items() if name != "values"}
     for _ in range(args.update_epochs):
         for index in torch.randperm(advantage.numel()).tensor_split(args.num_minibatches):
             losses = ppo_baseline.ppo_losses(agent, {name: x[index] for name, x in batch.items()}, args)
@@ -150,9 +150,9 @@ def simulate(kind: str, env_id: str, robot: str) -> tuple[float, float, np.ndarr
         env = ppo_baseline.wrappers.CPUGymWrapper(env, ignore_terminations=True)
     else:
         if kind == "heavy":
-            ppo_baseline.light_shaders = nullcontext
+            ppo_baseline.shaders_without_brdf_table = nullcontext
         triangles = 500 * (kind == "ours")
-        env = ppo_baseline.make_task(ppo_baseline.Args(env_id=env_id, robot=robot, mesh_triangles=triangles), 1)
+        env = ppo_baseline.make_task(ppo_baseline.Args(env_id=env_id, robot=robot, robot_triangles=triangles), 1)
     pictures, seconds, rng = [env.reset(seed=1)[0]["rgb"]], [], np.random.default_rng(0)
     start = time.process_time() - start
     for _ in range(20):
@@ -169,9 +169,9 @@ def rollout_rate(env_id: str, cores: set[int], episodes: int) -> float:
     torch.set_num_threads(len(cores))
     args = ppo_aib.Args(env_id=env_id, num_workers=2 * len(cores))
     envs = ppo_aib.make_envs(args)
-    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG), 25, 8, 0.6)
+    agent = ppo_aib.Agent(ppo_aib.AIBBelief(CONFIG), 25, 8, 0.6)
     seeds = np.arange(episodes)
-    seconds = [timed(ppo_aib.rollout_with_belief, envs, agent, args, seeds)[1] for _ in range(2)]
+    seconds = [timed(ppo_aib.rollout, envs, agent, args, seeds)[1] for _ in range(2)]
     envs.close()
     return episodes * ppo_aib.gym.spec(env_id).max_episode_steps / min(seconds)
 
@@ -218,7 +218,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
         data, seconds = timed(ppo_baseline.rollout, envs, agent, settings, seeds)
         times["our rollout"].append(seconds)
         times["our update"].append(update(agent, data, settings))
-        their_agent, their_data, seconds = mikasa(envs, len(data["reward"]), seeds)
+        their_agent, their_data, seconds = mikasa(envs, len(data["rewards"]), seeds)
         times["mikasa rollout"].append(seconds)
         times["mikasa update"].append(update(their_agent, their_data, settings))
     median = {name: statistics.median(values) for name, values in times.items()}
@@ -230,8 +230,8 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
 
     shares = {"plain PPO": (ppo_baseline.rollout, agent)}
     for name, amp in (("AIB", False), ("AIB, --amp", True)):
-        believing = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG, amp), joints_dim, action_dim, 0.6, amp)
-        shares[name] = (ppo_aib.rollout_with_belief, believing)
+        believing = ppo_aib.Agent(ppo_aib.AIBBelief(CONFIG, amp), joints_dim, action_dim, 0.6, amp)
+        shares[name] = (ppo_aib.rollout, believing)
     for name, (play, player) in shares.items():
         measured = []
         for _ in range(args.repeats):

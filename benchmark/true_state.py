@@ -103,7 +103,7 @@ def load_phi(args: Args) -> StateEncoder:
 
 if __name__ == "__main__":
     ppo_baseline.Args = Args
-    args = ppo_baseline.parse_args(ppo_baseline.TASKS, ppo_baseline.SMALL, ppo_baseline.QUICK)
+    args = ppo_baseline.parse_args()
     phi = load_phi(args) if args.phi else None
     ppo_baseline.Agent, ppo_baseline.make_envs = partial(StateAgent, phi=phi), make_envs
     ppo_baseline.make_video = lambda data: b""

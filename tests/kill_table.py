@@ -12,11 +12,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 ROOT = Path(__file__).parent.parent
 PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num_workers=3)
 SIZES = {
-    "aib_repr": dict(num_episodes=12, val_share=0.34, epochs=3, batch_size=30, num_workers=2),
-    "aib_belief": dict(num_episodes=12, num_updates=6, batch_episodes=4, held_out_every=2, image_shift=2),
+    "aib_repr": dict(num_episodes=12, val_fraction=0.34, epochs=3, batch_size=30, num_workers=2),
+    "aib_belief": dict(num_episodes=12, num_updates=6, batch_episodes=4, val_every=2, image_shift=2),
     "ppo_aib": dict(num_episodes=12, total_timesteps=240, **PPO),
     "ppo_believer": dict(
-        num_episodes=12, total_timesteps=160, num_updates=4, batch_episodes=4, held_out_every=2, image_shift=2, **PPO
+        num_episodes=12, total_timesteps=160, num_updates=4, batch_episodes=4, val_every=2, image_shift=2, **PPO
     ),
     "ppo_baseline": dict(total_timesteps=240, **PPO),
 }
@@ -32,7 +32,7 @@ KILLS = [  # script, what it was doing, the moment
     ("aib_belief", "stage 2, between checkpoints", "belief_losses:4"),
     ("aib_belief", "stage 2, held-out look", "encode:2"),
     ("aib_belief", "writing a checkpoint", "torch.save:2"),
-    ("aib_belief", "stage 2, diagnostics", "diagnose_belief:1"),
+    ("aib_belief", "stage 2, diagnostics", "probe_belief:1"),
     ("aib_belief", "renaming belief.pt", "os.replace:6"),
     ("ppo_aib", "PPO, evaluation", "env.step:45"),
     ("ppo_aib", "PPO, update", "ppo_losses:11"),

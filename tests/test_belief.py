@@ -43,7 +43,7 @@ def make_stage_1(folder: Path, episodes: int) -> int:
     arrays |= {"actions": rng.uniform(-1, 1, (episodes, 10, 2)), "cue": rng.integers(3, size=(episodes, 1))}
     for name, array in arrays.items():
         np.save(path / "dataset" / f"{name}.npy", array.astype(np.float32))
-    content = {"kind": "repr", "env_id": TOY, "robot": "panda_wristcam", "mesh_triangles": 500, "num_val": 8}
+    content = {"kind": "repr", "env_id": TOY, "robot": "panda_wristcam", "robot_triangles": 500, "num_val": 8}
     phi, psi = aib_repr.StateEncoder(4, 4), aib_repr.ObservationEncoder([128, 128, 3], 3, 4)
     content |= {"num_episodes": episodes, "u_dim": 4, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())}
     aib_repr.save(path / "repr.pt", content)
@@ -79,7 +79,7 @@ def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_
 
     monkeypatch.setattr(aib_belief, "encode", recorded)
     repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
-    path = train(aib_belief, repr_dir=repr_dir, num_episodes=20, num_updates=6, batch_episodes=4, held_out_every=2)
+    path = train(aib_belief, repr_dir=repr_dir, num_episodes=20, num_updates=6, batch_episodes=4, val_every=2)
     fit, test = [15, 16, 17], [18, 19]  # of 20 episodes, a quarter of which is held out
     assert [episodes for episodes, _ in looks] == [test] * 3 + [fit, test]
     stored = torch.load(path / "belief.pt", weights_only=True)
@@ -92,13 +92,13 @@ def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_
 
 def test_an_earlier_stage_gets_what_it_needs_to_know(monkeypatch: pytest.MonkeyPatch) -> None:
     commands = []
-    child = SimpleNamespace(wait=lambda: 0, send_signal=None)
-    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: commands.append(command) or child)
-    same = dict(env_id="RememberColor3-v0", seed=3, small=True, robot="panda", mesh_triangles=0, num_workers=5)
+    stage = SimpleNamespace(wait=lambda: 0, returncode=0)
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: commands.append(command) or stage)
+    same = dict(env_id="RememberColor3-v0", seed=3, small=True, robot="panda", robot_triangles=0, num_workers=5)
     for module, script in ((aib_belief, "aib_repr.py"), (ppo_aib, "aib_belief.py"), (ppo_believer, "aib_repr.py")):
         module.run_stage(script, module.Args(num_episodes=77, **same))
-        stage = {"aib_repr.py": aib_repr, "aib_belief.py": aib_belief}[script]
+        earlier = {"aib_repr.py": aib_repr, "aib_belief.py": aib_belief}[script]
         monkeypatch.setattr(sys, "argv", commands[-1][1:])
-        args = stage.parse_args({}, stage.SMALL, stage.QUICK)
+        args = earlier.parse_args()
         assert {**same, "num_episodes": 77}.items() <= asdict(args).items()
         assert args.exp_name == f"{script.removesuffix('.py')}_small"

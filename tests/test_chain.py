@@ -26,7 +26,7 @@ from conftest import ROOT, TASK, run
 def test_dataset(quick_runs: Path) -> None:
     data = quick_runs / f"{TASK}__aib_repr_quick__1" / "dataset"
     meta = json.loads((data / "meta.json").read_text())
-    assert (meta["env_id"], meta["mesh_triangles"], meta["episodes_done"]) == (TASK, 500, 8)
+    assert (meta["env_id"], meta["robot_triangles"], meta["episodes_done"]) == (TASK, 500, 8)
     arrays = {file.stem: np.load(file) for file in data.glob("*.npy")}
     state_dim = arrays["state"].shape[-1]
     expected = {
@@ -57,7 +57,15 @@ def test_results(quick_runs: Path, script: str) -> None:
     agent = torch.load(path / "agent.pt", weights_only=True)
     assert (agent["kind"], agent["env_id"], agent["global_step"]) == (f"{script} agent", TASK, 360)
     events = EventAccumulator(str(path)).Reload()
-    tags = {"charts/SPS", "losses/policy_loss", "losses/value_loss", "losses/approx_kl"}
+    tags = {
+        "charts/SPS",
+        "charts/updates",
+        "charts/episodic_return",
+        "losses/explained_variance",
+        "losses/policy_loss",
+        "losses/value_loss",
+        "losses/approx_kl",
+    }
     tags |= {"train/success_once", "eval/success_once", "eval/success_at_end", "eval/return"}
     tags |= {"time/rollout", "time/update"} | {f"eval/{name}" for name in of_belief}
     assert tags <= set(events.Tags()["scalars"])
@@ -192,7 +200,7 @@ def test_real_workers_end_with_their_parent_killed_or_stopped(quick_runs: Path, 
         wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 20)  # noqa: B023
         if number == signal.SIGINT:
             said = [line for line in err.splitlines() if line.strip() and "it/s" not in line and "step/s" not in line]
-            stopped = "stopped; the same command, without --overwrite, goes on from the last checkpoint"
+            stopped = "stopped; the same command, without --overwrite, resumes from the last checkpoint"
             assert process.returncode == 1 and said == [stopped]
     code, out, err = run("aib_repr", "--env-id", TASK, "--quick", cwd=tmp_path)
     assert code == 0, err

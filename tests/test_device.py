@@ -58,7 +58,7 @@ def test_stage_1() -> None:
 def test_stage_2(head: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the CNN in chunks, too."""
     module = ppo_believer if head == "believer" else aib_belief
-    monkeypatch.setattr(module, "FRAMES", 20)
+    monkeypatch.setattr(module, "CNN_CHUNK", 20)
     belief = ppo_believer.BelieverBelief(CONFIG) if head == "believer" else aib_belief.AIBBelief(CONFIG)
     model = nn.ModuleDict({"belief": belief, "posterior": module.GaussianMLP(U + 256, [8], 5, min_std=0.1)})
     if head in ("flow", "mse"):
@@ -84,12 +84,12 @@ def test_ppo(module: ModuleType) -> None:
         agent, play = module.Agent(IMAGE, J, A, 0.6), module.rollout
     else:
         belief = ppo_aib.AIBBelief(CONFIG) if module is ppo_aib else module.BelieverBelief(CONFIG)
-        agent, play = module.BeliefAgent(belief, J, A, 0.6), module.rollout_with_belief
+        agent, play = module.Agent(belief, J, A, 0.6), module.rollout
     args = module.Args(env_id=TOY, device="meta")
     data = play(toy.make_envs(SimpleNamespace(num_workers=2)), agent.to("meta"), args, np.arange(B))
-    values = data.pop("value")
-    data["advantage"] = module.compute_gae(data["reward"], values, args.gamma, args.gae_lambda)
-    data["return"] = data["advantage"] + values[:-1]
+    values = data.pop("values")
+    data["advantages"] = module.compute_gae(data["rewards"], values, args.gamma, args.gae_lambda)
+    data["returns"] = data["advantages"] + values[:-1]
     losses = module.ppo_losses(agent, {name: x.flatten(0, 1) for name, x in data.items()}, args)
     losses["total"].backward()
     assert {x.device.type for x in (*data.values(), *losses.values())} == {"meta"}

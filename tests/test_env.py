@@ -70,7 +70,7 @@ def test_the_batch_of_physx_cuda_is_played_and_recorded(
     for script in (aib_repr, ppo_baseline):
         monkeypatch.setattr(script, "make_task", lambda args, num_scenes: make_task(aib_repr.Args(env_id=TASK), 1).env)
     args = aib_repr.Args(env_id=TASK, sim_backend="physx_cuda", num_episodes=2, num_envs=1)
-    arrays = aib_repr.collect(args, tmp_path / "dataset")
+    arrays = aib_repr.collect_random_episodes(args, tmp_path / "dataset")
     obs, info = env.reset(seed=1_000_001 + 2**30)
     assert np.array_equal(arrays["rgb"][1, 0], obs["rgb"]) and np.array_equal(arrays["state"][1, 0], info["state"])
     for t in range(60):
@@ -81,7 +81,7 @@ def test_the_batch_of_physx_cuda_is_played_and_recorded(
     envs = ppo_baseline.make_envs(ppo_baseline.Args(env_id=TASK, sim_backend="physx_cuda", num_envs=1))
     agent = ppo_baseline.Agent([128, 128, 3], 25, 8, 0.6)
     data = ppo_baseline.rollout(envs, agent, ppo_baseline.Args(env_id=TASK), np.array([5, 6]))
-    assert data["rgb"].shape == (60, 2, 128, 128, 3) and data["value"].shape == (61, 2)
+    assert data["rgb"].shape == (60, 2, 128, 128, 3) and data["values"].shape == (61, 2)
     for i, seed in enumerate((5, 6)):
         assert np.array_equal(data["rgb"][0, i], env.reset(seed=seed)[0]["rgb"])
 

@@ -21,6 +21,7 @@ import ppo_believer
 import toy
 from conftest import SCRIPTS, TOY, run, train
 
+CHECK_TASK = ppo_baseline.check_task  # the real one, which the toy task does without
 NO_DRIVER = {"VK_DRIVER_FILES": "/nonexistent", "VK_ICD_FILENAMES": "/nonexistent"}
 
 
@@ -36,7 +37,11 @@ def refused(result: tuple[int, str, str], *words: str) -> None:
 @pytest.mark.parametrize(
     "script, arguments, words",
     [
-        ("ppo_aib", ["--env-id", "RememberColour9-v0"], ["unknown task", "RememberColor9-v0"]),
+        (
+            "ppo_aib",
+            ["--env-id", "RememberColour9-v0"],
+            ["RememberColour9-v0 is no task", "choose one of RememberColor9-v0"],
+        ),
         ("ppo_baseline", ["--env-id", "ShellGameTouch-v0"], ["needs an asset", "download_asset ycb"]),
     ],
 )
@@ -50,10 +55,10 @@ def test_no_rendering_device(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_light_meshes_only_where_there_is_one_scene_per_process(capsys: pytest.CaptureFixture) -> None:
+def test_decimated_meshes_only_where_there_is_one_scene_per_process(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit) as stop:
-        ppo_aib.check_task(ppo_aib.Args(sim_backend="physx_cuda", mesh_triangles=500))
-    refused((stop.value.code, *capsys.readouterr()), "meshes of 500 triangles", "physx_cpu")
+        ppo_aib.check_task(ppo_aib.Args(sim_backend="physx_cuda", robot_triangles=500))
+    refused((stop.value.code, *capsys.readouterr()), "--robot-triangles 500", "physx_cpu")
 
 
 def test_physx_without_its_library(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,7 +67,7 @@ def test_physx_without_its_library(capsys: pytest.CaptureFixture, monkeypatch: p
 
     monkeypatch.setattr(aib_repr.sapien.physx, "enable_gpu", enable_gpu)
     with pytest.raises(SystemExit) as stop:
-        aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", mesh_triangles=0))
+        aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", robot_triangles=0))
     refused((stop.value.code, *capsys.readouterr()), "physx_cuda does not start", "libcuda.so", "Troubleshooting")
 
 
@@ -80,11 +85,16 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_believer", ["--eval-every", "0"], ["--eval-every 0"]),
         ("ppo_baseline", ["--seed", "-1"], ["--seed -1"]),
         ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
-        ("ppo_baseline", ["--noise-beta", "-0.1"], ["--noise-beta -0.1", "at least 0"]),
-        ("ppo_aib", ["--noise-beta", "2.5"], ["--noise-beta 2.5", "at most 2"]),
+        ("ppo_baseline", ["--noise-beta", "-0.1"], ["--noise-beta -0.1", "between 0 and 2"]),
+        ("ppo_aib", ["--noise-beta", "2.5"], ["--noise-beta 2.5", "between 0 and 2"]),
         ("ppo_believer", ["--noise-beta", "nan"], ["--noise-beta nan"]),
-        ("aib_repr", ["--noise-beta", "3"], ["--noise-beta 3.0", "at most 2"]),
-        ("ppo_baseline", ["--gamma", "1.5"], ["--gamma 1.5", "at most 1"]),
+        ("aib_repr", ["--noise-beta", "3"], ["--noise-beta 3.0", "between 0 and 2"]),
+        ("ppo_baseline", ["--gamma", "1.5"], ["--gamma 1.5", "between 0 and 1"]),
+        ("ppo_aib", ["--small", "--quick"], ["--small and --quick exclude each other"]),
+        ("ppo_baseline", ["--exp-name", "a/b"], ["--exp-name a/b", "without /"]),
+        ("aib_belief", ["--image-shift", "-1"], ["--image-shift -1", "at least 0"]),
+        ("aib_repr", ["--val-fraction", "1.5"], ["--val-fraction 1.5", "between 0 and 1"]),
+        ("ppo_believer", ["--num-minibatches", "0"], ["--num-minibatches 0", "at least 1"]),
         ("ppo_baseline", ["--device", "cuda"], ["no CUDA device", "--device cpu"]),
     ],
 )
@@ -97,7 +107,7 @@ def test_numbers_and_devices(
 ) -> None:
     monkeypatch.setattr(sys, "argv", [script, *arguments])
     with pytest.raises(SystemExit) as stop:
-        SCRIPTS[script].parse_args({}, {}, {})
+        SCRIPTS[script].parse_args()
     refused((stop.value.code, *capsys.readouterr()), *words)
 
 
@@ -135,16 +145,16 @@ def other_dataset() -> None:
     (DATA / "meta.json").write_text(json.dumps({**meta, "format": 9}))
 
 
-STAGE_1 = dict(num_episodes=20, val_share=0.25, epochs=1, batch_size=50)
+STAGE_1 = dict(num_episodes=20, val_fraction=0.25, epochs=1, batch_size=50)
 STAGE_2 = dict(exp_name="again", num_updates=1)
 PPO = dict(num_envs=4, total_timesteps=40, num_eval_episodes=4, num_minibatches=2)
 ONLY_EVALUATE = dict(evaluate=True, num_envs=4, num_eval_episodes=4, checkpoint=str(AGENT))
 CASES = {  # name: (script, arguments, damage, words of the sentence)
-    "nothing held out": (aib_repr, dict(val_share=0.0), None, ["--val-share 0.0", "--num-episodes"]),
-    "all held out": (aib_repr, dict(val_share=1.0), None, ["--val-share 1.0"]),
+    "nothing held out": (aib_repr, dict(val_fraction=0.0), None, ["--val-fraction 0.0", "--num-episodes"]),
+    "all held out": (aib_repr, dict(val_fraction=1.0), None, ["--val-fraction 1.0"]),
     "no disk for it": (aib_repr, dict(exp_name="big", num_episodes=10**10), None, ["has free", "--num-episodes"]),
     "dataset of another format": (aib_repr, STAGE_1, other_dataset, ["has format 9", "--overwrite"]),
-    "repr.pt cut short": (aib_belief, STAGE_2, cut(REPR_PT), ["repr.pt is missing, damaged", "--overwrite"]),
+    "repr.pt cut short": (aib_belief, STAGE_2, cut(REPR_PT), ["repr.pt is damaged", "--overwrite"]),
     "repr.pt of another task": (aib_belief, STAGE_2, change(REPR_PT, env_id="X-v0"), ["has env_id X-v0"]),
     "repr.pt of another robot": (aib_belief, STAGE_2, change(REPR_PT, robot="panda"), ["has robot panda"]),
     "repr.pt of fewer episodes": (
@@ -154,21 +164,21 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
         ["has num_episodes 20"],
     ),
     "belief.pt of fewer episodes": (ppo_aib, {**PPO, "num_episodes": 30}, None, ["belief.pt has num_episodes 20"]),
-    "repr.pt of other meshes": (aib_belief, STAGE_2, change(REPR_PT, mesh_triangles=0), ["has mesh_triangles 0"]),
-    "named repr_dir missing": (aib_belief, {**STAGE_2, "repr_dir": "no"}, None, ["no/repr.pt is missing"]),
+    "repr.pt of other meshes": (aib_belief, STAGE_2, change(REPR_PT, robot_triangles=0), ["has robot_triangles 0"]),
+    "named repr_dir missing": (aib_belief, {**STAGE_2, "repr_dir": "no"}, None, ["no/repr.pt does not exist"]),
     "images cut short": (aib_belief, STAGE_2, cut(DATA / "rgb.npy"), ["dataset is damaged", "--overwrite"]),
     "an array missing": (aib_belief, STAGE_2, (DATA / "cue.npy").unlink, ["dataset is damaged", "cue.npy"]),
     "an array is a text": (aib_belief, STAGE_2, write(DATA / "state.npy", b"hello"), ["dataset is damaged"]),
-    "belief.pt cut short": (ppo_aib, PPO, cut(BELIEF_PT), ["belief.pt is missing, damaged", "aib_belief.py"]),
+    "belief.pt cut short": (ppo_aib, PPO, cut(BELIEF_PT), ["belief.pt is damaged", "aib_belief.py"]),
     "belief.pt is repr.pt": (ppo_aib, {**PPO, "belief": str(REPR_PT)}, None, ["has kind repr", "needs aib_belief"]),
     "belief.pt of Believer": (ppo_aib, PPO, change(BELIEF_PT, kind="believer_belief"), ["has kind believer_belief"]),
     "belief.pt of another task": (ppo_aib, PPO, change(BELIEF_PT, env_id="X-v0"), ["has env_id X-v0"]),
-    "named belief missing": (ppo_aib, {**PPO, "belief": "no.pt"}, None, ["no.pt is missing"]),
-    "Believer on a damaged repr.pt": (ppo_believer, PPO, cut(REPR_PT), ["repr.pt is missing, damaged"]),
-    "agent.pt missing": (ppo_baseline, {**ONLY_EVALUATE, "checkpoint": "no.pt"}, None, ["no.pt is missing"]),
+    "named belief missing": (ppo_aib, {**PPO, "belief": "no.pt"}, None, ["no.pt does not exist"]),
+    "Believer on a damaged repr.pt": (ppo_believer, PPO, cut(REPR_PT), ["repr.pt is damaged"]),
+    "agent.pt missing": (ppo_baseline, {**ONLY_EVALUATE, "checkpoint": "no.pt"}, None, ["no.pt does not exist"]),
     "agent.pt of another script": (ppo_aib, ONLY_EVALUATE, None, ["ppo_baseline agent", "needs ppo_aib agent"]),
-    "agent.pt cut short": (ppo_baseline, ONLY_EVALUATE, cut(AGENT), ["agent.pt is missing, damaged"]),
-    "checkpoint.pt cut short": (ppo_baseline, PPO, cut(CHECKPOINT), ["checkpoint.pt is missing, damaged"]),
+    "agent.pt cut short": (ppo_baseline, ONLY_EVALUATE, cut(AGENT), ["agent.pt is damaged"]),
+    "checkpoint.pt cut short": (ppo_baseline, PPO, cut(CHECKPOINT), ["checkpoint.pt is damaged"]),
     "other arguments": (ppo_baseline, {**PPO, "gamma": 0.5}, None, ["gamma=0.99 there, 0.5 here", "--exp-name"]),
     "runs is a file": (
         ppo_baseline,
@@ -223,13 +233,13 @@ def test_bad_files_and_arguments(folder: Path, capfd: pytest.CaptureFixture, nam
 @pytest.mark.parametrize(
     "content, words",
     [
-        (b"", ["is missing, damaged"]),
-        (b"hello", ["is missing, damaged"]),
-        (pickle.dumps(Payload()), ["is missing, damaged"]),
-        ({"format": ppo_baseline.FORMAT, "kind": "x", "code": Payload()}, ["is missing, damaged"]),
+        (b"", ["is damaged"]),
+        (b"hello", ["is damaged"]),
+        (pickle.dumps(Payload()), ["is damaged"]),
+        ({"format": ppo_baseline.FORMAT, "kind": "x", "code": Payload()}, ["is damaged"]),
         ({"format": 99, "kind": "x"}, ["has format 99"]),
         ({"format": ppo_baseline.FORMAT, "kind": "y"}, ["has kind y, this run needs x"]),
-        ([1, 2], ["is missing, damaged"]),
+        ([1, 2], ["is damaged"]),
     ],
 )
 def test_what_load_refuses(tmp_path: Path, capsys: pytest.CaptureFixture, content: object, words: list[str]) -> None:
@@ -239,8 +249,8 @@ def test_what_load_refuses(tmp_path: Path, capsys: pytest.CaptureFixture, conten
     else:
         torch.save(content, file)
     with pytest.raises(SystemExit) as stop:
-        ppo_baseline.load(file, "make it anew", kind="x")
-    refused((stop.value.code, *capsys.readouterr()), "file.pt", "make it anew", *words)
+        ppo_baseline.load(file, "recreate it", kind="x")
+    refused((stop.value.code, *capsys.readouterr()), "file.pt", "recreate it", *words)
     assert not Path("executed").exists(), "no code of a file runs"
 
 
@@ -270,7 +280,40 @@ def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.Cap
     refused((stop.value.code, *capfd.readouterr()), "has repr_crc", "--overwrite")
 
 
-def test_overwrite_starts_anew(folder: Path) -> None:
+@pytest.mark.parametrize(
+    "script, wrong, words",
+    [
+        ("aib_repr", dict(val_fraction=0.0), ["--val-fraction 0.0"]),
+        ("aib_belief", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
+        ("ppo_aib", dict(belief="nope.pt"), ["nope.pt does not exist"]),
+        ("ppo_believer", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
+        ("ppo_baseline", dict(env_id="ToyMemoryy-v0"), ["ToyMemoryy-v0 is no task"]),
+    ],
+)
+def test_overwrite_deletes_nothing_before_the_inputs_are_read(
+    toy_task: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture,
+    script: str,
+    wrong: dict,
+    words: list[str],
+) -> None:
+    module = SCRIPTS[script]
+    if script == "ppo_baseline":
+        monkeypatch.setattr(module, "check_task", CHECK_TASK)
+    args = module.Args(**{"env_id": TOY, **wrong}, overwrite=True)
+    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
+    for existing in (False, True):
+        if existing:
+            path.mkdir(parents=True)
+            (path / "agent.pt").write_bytes(b"days of work")
+        with pytest.raises(SystemExit) as stop:
+            module.main(args)
+        refused((stop.value.code, *capfd.readouterr()), *words)
+        assert (path / "agent.pt").exists() if existing else not Path("runs").exists()
+
+
+def test_overwrite_starts_again(folder: Path) -> None:
     leftover = AGENT.parent / "videos" / "old.mp4"
     leftover.write_text("old")
     train(ppo_baseline, **{**PPO, "gamma": 0.5, "overwrite": True})

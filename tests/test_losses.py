@@ -112,7 +112,7 @@ def test_transitions_lie_within_an_episode_and_each_is_learnt_from_once_an_epoch
             assert np.array_equal(batch[f"next_{name}"][row], arrays[name][episode, t + 1]), name
     read, transitions = [], aib_repr.read_transitions
     monkeypatch.setattr(aib_repr, "read_transitions", lambda *args: read.append(args[1]) or transitions(*args))
-    train(aib_repr, num_episodes=20, val_share=0.25, epochs=2, batch_size=50)
+    train(aib_repr, num_episodes=20, val_fraction=0.25, epochs=2, batch_size=50)
     epochs, held_out = [np.concatenate(read[:3]), np.concatenate(read[4:7])], [read[3], read[7]]
     assert all(sorted(epoch) == list(range(150)) for epoch in epochs), "of 15 episodes of 10 steps"
     assert not np.array_equal(*epochs) and not np.array_equal(epochs[0], np.arange(150))
@@ -211,23 +211,6 @@ def test_believer_has_a_fixed_prior() -> None:
     assert torch.allclose(belief.decode(h[0], z).mean, d.mean, atol=1e-5)
 
 
-def test_particles_are_draws_from_prior_and_decoder() -> None:
-    torch.manual_seed(0)
-    belief, batch = ppo_aib.AIBBelief(CONFIG), belief_batch()
-    agent = ppo_aib.BeliefAgent(belief, 7, A, 0.6)
-    z_noise, u_noise = torch.randn(B, 30, 5), torch.randn(B, 30, 4)
-    memory = None
-    for t in range(2):
-        seen = {name: batch[name][t] for name in ("rgb", "joints")}
-        drawn, memory = agent.draw_particles(seen, memory, z_noise, u_noise)
-    h = aib_belief.encode_history(belief.history, batch)[1]
-    p = belief.prior(h)
-    assert drawn.shape == (B, 30, 4)
-    for i in (0, 29):
-        d = belief.decoder(torch.cat([p.mean + p.stddev * z_noise[:, i], h], -1))
-        assert torch.allclose(drawn[:, i], d.mean + d.stddev * u_noise[:, i], atol=1e-5)
-
-
 def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
     model, batch = belief_model(), belief_batch()
     belief, posterior = model["belief"], model["posterior"]
@@ -275,7 +258,7 @@ def test_truncated_back_propagation_cuts_exactly() -> None:
 def test_chunks_of_frames_give_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
     gradients = []
     for frames in (2048, 5):
-        monkeypatch.setattr(aib_belief, "FRAMES", frames)
+        monkeypatch.setattr(aib_belief, "CNN_CHUNK", frames)
         model, batch = belief_model(config={**CONFIG, "joints_dim": 7}), belief_batch()
         aib_belief.belief_losses(model, batch, losses_args())["total"].backward()
         gradients.append([parameter.grad for parameter in model.parameters()])
@@ -354,7 +337,7 @@ def test_readout_score_on_features_of_known_content() -> None:
 
     def score(y: torch.Tensor, features: torch.Tensor = x, count: int = 2000) -> float:
         fit, test = slice(0, count), slice(2000, 3000)
-        return aib_belief.readout_score(features[fit], y[fit], features[test], y[test])
+        return aib_belief.probe_score(features[fit], y[fit], features[test], y[test])
 
     assert score((x[:, :1] > 0).float() * 3, x[:, :6]) > 0.95, "two colours"
     assert score(torch.bucketize(x[:, :1], torch.tensor([-0.5, 0.5])).float(), x[:, :1]) > 0.9, "three on a line"
@@ -374,7 +357,7 @@ def test_report_of_a_belief_that_knows_and_of_its_chance() -> None:
         seen = {"u": u, "particle": u + 0.1, "posterior": u, "h": torch.cat([u, known], -1), "cue": cue}
         seen |= {"nll_prior": torch.ones(40, T + 1), "nll_posterior": torch.zeros(40, T + 1)}
         seen |= {"z_mean": torch.randn(40, T + 1, 5), "action": torch.rand(40, T, A)}
-        report = aib_belief.diagnose_belief(*({name: x[part] for name, x in seen.items()} for part in (SELECT, REPORT)))
+        report = aib_belief.probe_belief(*({name: x[part] for name, x in seen.items()} for part in (SELECT, REPORT)))
         assert report["cue_chance"] == pytest.approx(chance)
         assert (report["nll_prior"], report["nll_posterior"]) == (1, 0)
         assert min(report["cue_from_h"]) > 0.95 and min(report["u_r2_posterior"]) == 1
@@ -414,7 +397,7 @@ def test_gae_is_the_double_sum() -> None:
 
 def test_belief_aggregator_is_the_papers_formula() -> None:
     torch.manual_seed(0)
-    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(CONFIG), 7, A, 0.6)
+    agent = ppo_aib.Agent(ppo_aib.AIBBelief(CONFIG), 7, A, 0.6)
     obs = {"rgb": torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8), "joints": torch.randn(B, 7)}
     particles = torch.randn(B, 30, 4)
     nn.init.orthogonal_(agent.actor[-1].weight, 3.0)  # else too near 0 to tell tanh from nothing
@@ -433,7 +416,7 @@ def test_belief_aggregator_is_the_papers_formula() -> None:
 
 def test_success_once_and_at_end() -> None:
     success = torch.tensor([[0.0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 0]])  # in 3 of 4 episodes once, at the end in 1
-    metrics = ppo_aib.success_and_return({"success": success, "reward": torch.full((3, 4), 0.5)})
+    metrics = ppo_aib.success_and_return({"success": success, "rewards": torch.full((3, 4), 0.5)})
     assert metrics == {"success_once": 0.75, "success_at_end": 0.25, "return": 1.5}
 
 
@@ -441,14 +424,14 @@ def test_ppo_losses_are_the_closed_forms() -> None:
     args = SimpleNamespace(clip_coef=0.2, ent_coef=0.01, vf_coef=0.5)
     mean, log_std = torch.randn(64, A), torch.full((A,), -0.5)
     policy, value = Normal(mean, log_std.exp().expand(64, A)), torch.randn(64)
-    batch = {"action": policy.sample(), "advantage": torch.randn(64), "return": torch.randn(64)}
-    batch["logprob"] = policy.log_prob(batch["action"]).sum(-1) + 0.3 * torch.randn(64)
+    batch = {"actions": policy.sample(), "advantages": torch.randn(64), "returns": torch.randn(64)}
+    batch["logprobs"] = policy.log_prob(batch["actions"]).sum(-1) + 0.3 * torch.randn(64)
     losses = ppo_aib.ppo_losses(lambda _: (policy, value), batch, args)
-    ratio = (policy.log_prob(batch["action"]).sum(-1) - batch["logprob"]).exp()
-    a = (batch["advantage"] - batch["advantage"].mean()) / (batch["advantage"].std(correction=0) + 1e-8)
+    ratio = (policy.log_prob(batch["actions"]).sum(-1) - batch["logprobs"]).exp()
+    a = (batch["advantages"] - batch["advantages"].mean()) / (batch["advantages"].std(correction=0) + 1e-8)
     surrogate = torch.where(a >= 0, ratio.clamp(max=1.2) * a, ratio.clamp(min=0.8) * a)
     assert torch.allclose(losses["policy_loss"], -surrogate.mean(), atol=1e-6)
-    assert torch.allclose(losses["value_loss"], 0.5 * ((value - batch["return"]) ** 2).mean())
+    assert torch.allclose(losses["value_loss"], 0.5 * ((value - batch["returns"]) ** 2).mean())
     entropy = A * (-0.5 + 0.5 * math.log(2 * math.pi * math.e))
     assert abs(losses["entropy"].item() - entropy) < 1e-4
     total = losses["policy_loss"] - 0.01 * losses["entropy"] + 0.5 * losses["value_loss"]

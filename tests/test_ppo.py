@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import aib_belief
 import ppo_aib
@@ -33,15 +34,15 @@ def small(module: ModuleType, toy_stages: Path, **changes: object) -> dict:
     return {**SMALL, **more, **changes}
 
 
-def play(toy_stages: Path, **changes: object) -> tuple[ppo_aib.BeliefAgent, dict[str, torch.Tensor]]:
+def play(toy_stages: Path, **changes: object) -> tuple[ppo_aib.Agent, dict[str, torch.Tensor]]:
     """An AIB agent and what it played in one iteration of the toy task."""
     args = ppo_aib.Args(env_id=TOY, **small(ppo_aib, toy_stages, **changes))
     stored = torch.load(args.belief, weights_only=True)
     torch.manual_seed(0)
-    agent = ppo_aib.BeliefAgent(ppo_aib.AIBBelief(stored["config"], args.amp), 3, 2, 0.6, args.amp)
+    agent = ppo_aib.Agent(ppo_aib.AIBBelief(stored["config"], args.amp), 3, 2, 0.6, args.amp)
     agent.belief.load_state_dict(stored["belief"])
     torch.manual_seed(1)
-    return agent, ppo_aib.rollout_with_belief(toy.make_envs(args), agent, args, np.arange(8))
+    return agent, ppo_aib.rollout(toy.make_envs(args), agent, args, np.arange(8))
 
 
 def test_rollout_arrays(toy_stages: Path) -> None:
@@ -50,12 +51,23 @@ def test_rollout_arrays(toy_stages: Path) -> None:
         "rgb": ((10, 8, 36, 36, 3), torch.uint8),
         "joints": ((10, 8, 3), torch.float32),
         "particles": ((10, 8, 30, 16), torch.float32),
-        "action": ((10, 8, 2), torch.float32),
-        "logprob": ((10, 8), torch.float32),
-        "value": ((11, 8), torch.float32),
-        "reward": ((10, 8), torch.float32),
+        "actions": ((10, 8, 2), torch.float32),
+        "logprobs": ((10, 8), torch.float32),
+        "values": ((11, 8), torch.float32),
+        "rewards": ((10, 8), torch.float32),
         "success": ((10, 8), torch.float32),
     }
+
+
+def test_particles_are_draws_from_prior_and_decoder(toy_stages: Path) -> None:
+    agent, data = play(toy_stages)
+    torch.manual_seed(1)  # as play does before the rollout
+    z_noise, u_noise = torch.randn(11, 8, 30, 32), torch.randn(11, 8, 30, 16)
+    h = aib_belief.encode_history(agent.belief.history, data)
+    p = agent.belief.prior(h)
+    for i in (0, 29):
+        d = agent.belief.decoder(torch.cat([p.mean + p.stddev * z_noise[:10, :, i], h], -1))
+        assert torch.allclose(data["particles"][:, :, i], d.mean + d.stddev * u_noise[:10, :, i], atol=1e-4)
 
 
 def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path) -> None:
@@ -64,7 +76,7 @@ def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path
 
     def ratio(particles: torch.Tensor) -> torch.Tensor:
         policy, _ = agent({**batch, "particles": particles})
-        return (policy.log_prob(batch["action"]).sum(-1) - batch["logprob"]).exp()
+        return (policy.log_prob(batch["actions"]).sum(-1) - batch["logprobs"]).exp()
 
     assert torch.allclose(ratio(batch["particles"]), torch.ones(80), atol=1e-5)
     decoded = agent.belief.decode(aib_belief.encode_history(agent.belief.history, data), torch.randn(10, 8, 30, 32))
@@ -80,7 +92,7 @@ def test_amp_changes_the_belief_by_rounding_only(toy_stages: Path) -> None:
 
 
 def test_particle_noise_is_the_decoders(toy_stages: Path) -> None:
-    drawn, means = (play(toy_stages, particle_noise=noise)[1]["particles"][0] for noise in (True, False))
+    drawn, means = (play(toy_stages, sample_decoder=noise)[1]["particles"][0] for noise in (True, False))
     assert drawn.std(1).mean() > 0.5 and means.std(1).mean() < 0.2  # the decoder's std is still about softplus(0) + 0.1
 
 
@@ -94,20 +106,20 @@ def test_u_r2_tells_what_the_belief_knows_of_the_episodes_just_played(
     stored = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)
     phi = module.StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"])
     phi.load_state_dict(stored["phi"])
-    played, rollout = [], module.rollout_with_belief
+    played, rollout = [], module.rollout
 
-    def informed(*arguments: object, explore: bool) -> dict[str, torch.Tensor]:
-        data = rollout(*arguments, explore=explore)
+    def informed(*arguments: object, deterministic: bool) -> dict[str, torch.Tensor]:
+        data = rollout(*arguments, deterministic=deterministic)
         u = phi(data["state"]).mean
         error = size * (u - u.mean((0, 1))).square().mean((0, 1)).sqrt() * torch.randn_like(u)
         played.append(data)
         return {**data, "particles": (u + error)[:, :, None].expand(-1, -1, 30, -1)}
 
-    monkeypatch.setattr(module, "rollout_with_belief", informed)
+    monkeypatch.setattr(module, "rollout", informed)
     belief = ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief
-    agent = module.BeliefAgent(belief(stored["config"]), 3, 2, 0.6)
+    agent = module.Agent(belief(stored["config"]), 3, 2, 0.6)
     for size, expected in ((0.0, 1.0), (0.5**0.5, 0.5)):  # noqa: B007  (informed reads it)
-        metrics, _ = module.evaluate_with_belief(toy.make_envs(args), agent, args, phi)
+        metrics, _ = module.evaluate(toy.make_envs(args), agent, args, phi)
         assert metrics["u_r2"] == pytest.approx(expected, abs=0.1)
     assert list(metrics)[-2:] == ["u_r2", "u_r2_at_end"] and metrics["u_r2_at_end"] < 1
     envs = toy.make_envs(args)
@@ -115,7 +127,7 @@ def test_u_r2_tells_what_the_belief_knows_of_the_episodes_just_played(
         _, info = envs.reset(seed=[module.EVAL_SEED + min(i + k, 15) for k in range(3)])
         rows = slice(i, min(i + 3, 16))
         assert np.array_equal(played[0]["state"][0, rows], info["state"][: rows.stop - i])
-    random = rollout(envs, agent, args, np.arange(3), explore=True)
+    random = rollout(envs, agent, args, np.arange(3))
     assert "state" not in random, "training does not see the privileged state"
 
 
@@ -146,15 +158,15 @@ def test_the_three_methods_explore_with_the_same_noise(toy_stages: Path) -> None
         module, policy = SCRIPTS[script], []
         args = module.Args(env_id=TOY, noise_beta=0.7, **small(module, toy_stages))
         if script == "ppo_baseline":
-            agent, rollout = module.Agent([36, 36, 3], 3, 2, 0.6), module.rollout
+            agent = module.Agent([36, 36, 3], 3, 2, 0.6)
         else:
             stored = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)
             belief = ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief
-            agent, rollout = module.BeliefAgent(belief(stored["config"]), 3, 2, 0.6), module.rollout_with_belief
+            agent = module.Agent(belief(stored["config"]), 3, 2, 0.6)
         agent.register_forward_hook(lambda _, inputs, output, seen=policy: seen.append(output[0]))
         for seeds in (np.arange(3), np.arange(3, 6)):  # one round each
-            data = rollout(toy.make_envs(args), agent, args, seeds)
-            steps = zip(data["action"], policy[-11:], strict=False)
+            data = module.rollout(toy.make_envs(args), agent, args, seeds)
+            steps = zip(data["actions"], policy[-11:], strict=False)
             drawn.append(torch.stack([(action - p.mean) / p.stddev for action, p in steps]))
     for other in (drawn[2], drawn[4]):
         assert torch.allclose(drawn[0], other, atol=1e-4)
@@ -166,15 +178,14 @@ def test_an_iteration_plays_new_episodes_and_learns_from_each_step_with_its_own_
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
 ) -> None:
     module, played, seen = SCRIPTS[script], [], []
-    name = "rollout" if script == "ppo_baseline" else "rollout_with_belief"
-    rollout, losses = getattr(module, name), module.ppo_losses
+    rollout, losses = module.rollout, module.ppo_losses
 
-    def watched_rollout(*args: object, explore: bool = True) -> dict:
-        data = rollout(*args, explore=explore)
-        played.append((explore, args[3].tolist(), {name: x.clone() for name, x in data.items()}))
+    def watched_rollout(*args: object, deterministic: bool = False) -> dict:
+        data = rollout(*args, deterministic=deterministic)
+        played.append((not deterministic, args[3].tolist(), {name: x.clone() for name, x in data.items()}))
         return data
 
-    monkeypatch.setattr(module, name, watched_rollout)
+    monkeypatch.setattr(module, "rollout", watched_rollout)
     monkeypatch.setattr(
         module, "ppo_losses", lambda agent, batch, args: seen.append(batch) or losses(agent, batch, args)
     )
@@ -183,20 +194,20 @@ def test_an_iteration_plays_new_episodes_and_learns_from_each_step_with_its_own_
     evaluated, evaluated_again = (one[1] for one in played if not one[0])
     assert len({*seeds, *other_seeds, *evaluated}) == 8 + 8 + 6 and evaluated == evaluated_again
     assert max(seeds + other_seeds) < 2**30 <= min(evaluated)
-    key, other_key = data["logprob"], other["logprob"]  # tells the noise, whatever the policy's means
+    key, other_key = data["logprobs"], other["logprobs"]  # tells the noise, whatever the policy's means
     assert min(key.std(0).min(), key.std(1).min(), (key - other_key).std()) > 0.1, "fresh noise at every step"
 
-    assert len(seen) == 2 * 2 * 4 and all(len(batch["action"]) == 20 for batch in seen)
-    values = data["value"]
-    data["advantage"] = module.compute_gae(data["reward"], values, 0.99, 0.9)
-    data["return"] = data["advantage"] + values[:-1]
+    assert len(seen) == 2 * 2 * 4 and all(len(batch["actions"]) == 20 for batch in seen)
+    values = data["values"]
+    data["advantages"] = module.compute_gae(data["rewards"], values, 0.99, 0.9)
+    data["returns"] = data["advantages"] + values[:-1]
     order = key.flatten().argsort()
     for batches in (seen[:4], seen[4:8]):
-        keys = torch.cat([batch["logprob"] for batch in batches])
+        keys = torch.cat([batch["logprobs"] for batch in batches])
         for name in seen[0]:
             x = torch.cat([batch[name] for batch in batches])
             assert torch.equal(x[keys.argsort()], data[name].flatten(0, 1)[order]), name
-    assert not torch.equal(seen[0]["logprob"], seen[4]["logprob"]), "each pass in an order of its own"
+    assert not torch.equal(seen[0]["logprobs"], seen[4]["logprobs"]), "each pass in an order of its own"
     adam = torch.load(path / "checkpoint.pt", weights_only=True)["optimizer"]["param_groups"][0]
     assert (adam["lr"], adam["eps"]) == (1e-4, 1e-5)
 
@@ -224,8 +235,12 @@ def test_the_update_ends_at_the_kl_target(
     """Of two iterations: with a tiny target only the first minibatch, whose KL is 0, is learnt from."""
     taken, step = [], torch.optim.Adam.step
     monkeypatch.setattr(torch.optim.Adam, "step", lambda self: (taken.append(1), step(self))[1])
-    train(ppo_baseline, **small(ppo_baseline, toy_stages, target_kl=target_kl, learning_rate=1e-2))
+    path = train(ppo_baseline, **small(ppo_baseline, toy_stages, target_kl=target_kl, learning_rate=1e-2))
     assert len(taken) == updates
+    events = EventAccumulator(str(path)).Reload()
+    assert sum(event.value for event in events.Scalars("charts/updates")) == updates
+    for event in events.Scalars("losses/approx_kl"):  # of minibatches that were stepped on, not of the one refused
+        assert event.value <= target_kl
 
 
 @pytest.mark.parametrize("script", ["ppo_aib", "ppo_believer"])
@@ -239,7 +254,7 @@ def test_the_belief_is_frozen_and_the_aggregator_learns(toy_task: Path, toy_stag
     assert all(torch.equal(trained["agent"][f"belief.{name}"], value) for name, value in before.items())
     torch.manual_seed(1)
     belief = (ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief)(trained["config"])
-    start = module.BeliefAgent(belief, 3, 2, module.Args.init_std).state_dict()
+    start = module.Agent(belief, 3, 2, module.Args.init_std).state_dict()
     for part in ("w_enc.0.weight", "w_agg.2.weight", "cnn.conv.0.weight", "actor.2.weight", "log_std"):
         assert not torch.equal(trained["agent"][part], start[part]), part
 
@@ -291,12 +306,12 @@ def test_table_5(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
     tasks |= {"InterceptMedium-v0": (10_000_000, 256, 2, 0.99), "InterceptFast-v0": (10_000_000, 256, 2, 0.99)}
     for task, values in tasks.items():
         monkeypatch.setattr(sys, "argv", ["script", "--env-id", task])
-        args = module.parse_args(module.TASKS, module.SMALL, module.QUICK)
+        args = module.parse_args()
         assert (args.env_id, args.total_timesteps, args.num_envs, args.update_epochs, args.gamma) == (task, *values)
         common = (args.learning_rate, args.gae_lambda, args.ent_coef, args.target_kl, args.num_minibatches)
         assert common == (1e-4, 0.9, 0.001, 0.05, 32)
     monkeypatch.setattr(sys, "argv", ["script", "--quick", "--env-id=RememberColor9-v0", "--gamma", "0.5"])
-    args = module.parse_args(module.TASKS, module.SMALL, module.QUICK)
+    args = module.parse_args()
     assert (args.num_envs, args.gamma, args.quick, args.exp_name) == (2, 0.5, True, f"{script}_quick")
 
 
@@ -313,7 +328,7 @@ def test_help_shows_what_will_run(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     for module in SCRIPTS.values():
         monkeypatch.setattr(sys, "argv", ["script", "--help", "--env-id", "RememberColor9-v0"])
         with pytest.raises(SystemExit):
-            module.parse_args(getattr(module, "TASKS", {}), module.SMALL, module.QUICK)
+            module.parse_args()
         shown = capsys.readouterr().out
         assert shown.count("default: None") == ("bptt" in shown), "only where nothing is the value"
-        assert "10380000" in shown or not hasattr(module, "TASKS")
+        assert "10380000" in shown or not module.TASKS
