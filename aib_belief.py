@@ -25,6 +25,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: idle threads must not starve other runs
+
 import numpy as np
 import torch
 import torch.nn as nn
@@ -555,6 +557,8 @@ def parse_args() -> Args:
             fail(f"--{name.replace('_', '-')} {value} must be {bounds}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
+    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
+        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
     return args
 
 

@@ -17,6 +17,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import zipfile
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -24,6 +25,8 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: idle threads must not starve other runs
 
 import colorednoise
 import gymnasium as gym
@@ -526,8 +529,10 @@ def check_task(args: Args) -> None:
     try:
         sapien.render.RenderSystem(sapien.Device(args.render_backend.removeprefix("sapien_")))
         if args.sim_backend == "physx_cuda":
-            sapien.physx.enable_gpu()  # which downloads a library
-    except (OSError, RuntimeError) as error:
+            with open(Path.home() / ".sapien_physx.lock", "w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # jobs that start together must not download its library together
+                sapien.physx.enable_gpu()
+    except (OSError, RuntimeError, zipfile.BadZipFile) as error:
         fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see README, Troubleshooting")
 
 
@@ -560,6 +565,8 @@ def parse_args() -> Args:
             fail(f"--{name.replace('_', '-')} {value} must be {bounds}")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
+    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
+        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
     return args
 
 

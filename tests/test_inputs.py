@@ -71,6 +71,30 @@ def test_physx_without_its_library(capsys: pytest.CaptureFixture, monkeypatch: p
     refused((stop.value.code, *capsys.readouterr()), "physx_cuda does not start", "libcuda.so", "Troubleshooting")
 
 
+def test_physx_is_downloaded_by_one_process_at_a_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def enable_gpu() -> None:
+        with open(tmp_path / ".sapien_physx.lock") as other, pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        started.append(1)
+
+    started = []
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(aib_repr.sapien.physx, "enable_gpu", enable_gpu)
+    aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", robot_triangles=0))
+    assert started
+
+
+def test_the_gpus_physics_with_the_cpus_pictures(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    for module in SCRIPTS.values():
+        monkeypatch.setattr(module, "CUDA", True)
+        monkeypatch.setattr(sys, "argv", ["script", "--sim-backend", "physx_cuda", "--render-backend", "sapien_cpu"])
+        with pytest.raises(SystemExit) as stop:
+            module.parse_args()
+        refused((stop.value.code, *capsys.readouterr()), "physx_cuda needs --render-backend sapien_cuda")
+
+
 def test_a_folder_that_cannot_be_written() -> None:
     """Even root may not make a folder in /sys."""
     refused(run("ppo_baseline", cwd=Path("/sys")), "cannot be written")
