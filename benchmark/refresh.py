@@ -143,9 +143,8 @@ def main(args: Args) -> None:
     known = " / ".join(f"{r2[t]:.2f}" for t in (4, 9, 30, -1))
     print(f"{len(rows)} episodes of the agent, success_once {torch.cat(success).mean():.2f}")
     print(f"R2 of u, mean particle, held-out scenes, steps 4 / 9 / 30 / last: {known}")
-    print(
-        "the same when the policy is random: u_r2_prior in diagnostics.json of the belief (Believer's: benchmark/belief.py)"
-    )
+    print("the same when the policy is random: u_r2_prior in the belief's diagnostics.json")
+    print("(Believer's is written by benchmark/belief.py)")
     print(f"{path} is finished; the stages after it need --num-episodes {len(scenes)}")
 
 
