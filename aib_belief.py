@@ -29,19 +29,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: idle thread
 
 import numpy as np
 import torch
-import torch.nn as nn
 import torch.utils.checkpoint
 import tyro
 from sklearn import linear_model, pipeline, preprocessing
+from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 6  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
+ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX; with the next line, glibc keeps freed memory for the next update
+ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
 # ---------------------------------------------------------------- arguments
@@ -141,7 +143,7 @@ class GaussianMLP(nn.Module):
         self.net = mlp([inputs, *hidden, 2 * size])
         self.min_std = min_std
 
-    def forward(self, x: torch.Tensor) -> Normal:
+    def forward(self, x: Tensor) -> Normal:
         mean, raw = self.net(x).chunk(2, -1)
         return Normal(mean, nn.functional.softplus(raw) + self.min_std, validate_args=False)
 
@@ -173,7 +175,7 @@ class NatureCNN(nn.Module):
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
         self.out = nn.Sequential(nn.Linear(flat, size), nn.ReLU())
 
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
+    def forward(self, images: Tensor) -> Tensor:
         with torch.autocast(images.device.type, torch.bfloat16, enabled=self.amp):
             return self.out(self.conv(images.permute(0, 3, 1, 2))).float()
 
@@ -187,7 +189,7 @@ class StateEncoder(nn.Module):
         self.register_buffer("std", torch.ones(state_dim))
         self.net = GaussianMLP(state_dim, [256, 256], u_dim, min_std=1e-5)
 
-    def forward(self, state: torch.Tensor) -> Normal:
+    def forward(self, state: Tensor) -> Normal:
         return self.net((state - self.mean) / self.std)
 
 
@@ -209,12 +211,12 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
 
-    def embed(self, rgb: torch.Tensor, joints: torch.Tensor) -> torch.Tensor:
+    def embed(self, rgb: Tensor, joints: Tensor) -> Tensor:
         """Images (B, H, W, 3) uint8 and joints (B, J) -> the GRU's input x (B, 512 + J), or (B, 512) without joints."""
         x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
-    def forward(self, x: torch.Tensor, hidden: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """x (T, B, .) of T steps that follow the GRU's state hidden (None: start) -> h (T, B, 256), hidden."""
         output, hidden = self.gru(x, hidden)
         return self.out(torch.cat([output, x], -1)), hidden
@@ -232,7 +234,7 @@ def chrono_init(gru: nn.GRU, steps: int) -> None:
 class AIBBelief(nn.Module):
     """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h), all that acting needs (paper 3.2).
 
-    config: image_shape [H, W, 3], joints_dim (0: none in the history), gru_layers, u_dim, z_dim.
+    config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -241,8 +243,9 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # says what u is; only evaluations need it
 
-    def decode(self, h: torch.Tensor, z_noise: torch.Tensor) -> Normal:
+    def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """Give p(u|z_i,h) of z_i ~ p(z|h), i = 1..n: h (..., 256), noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
         p = self.prior(h)
         z = p.mean.unsqueeze(-2) + p.stddev.unsqueeze(-2) * z_noise
@@ -252,7 +255,7 @@ class AIBBelief(nn.Module):
 # ---------------------------------------------------------------- losses
 
 
-def encode_history(history: nn.Module, batch: dict[str, torch.Tensor], bptt_steps: int | None = None) -> torch.Tensor:
+def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int | None = None) -> Tensor:
     """h (T, B, 256) of whole episodes: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
 
     All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in chunks
@@ -273,7 +276,7 @@ def encode_history(history: nn.Module, batch: dict[str, torch.Tensor], bptt_step
     return torch.cat(outputs)
 
 
-def elbo_terms(belief: nn.Module, posterior: nn.Module, u: torch.Tensor, h: torch.Tensor) -> tuple[torch.Tensor, ...]:
+def elbo_terms(belief: nn.Module, posterior: nn.Module, u: Tensor, h: Tensor) -> tuple[Tensor, ...]:
     """Terms of -L_VAE at each step (...,): -log p(u|z,h) and KL(q || p); then z ~ q and the mean of q (..., z_dim)."""
     q = posterior(torch.cat([u, h], -1))
     z = q.rsample()
@@ -282,8 +285,8 @@ def elbo_terms(belief: nn.Module, posterior: nn.Module, u: torch.Tensor, h: torc
 
 
 def flow_matching_loss(
-    head: nn.Module, action: torch.Tensor, z: torch.Tensor, z_next: torch.Tensor, noise: torch.Tensor, tau: torch.Tensor
-) -> torch.Tensor:
+    head: nn.Module, action: Tensor, z: Tensor, z_next: Tensor, noise: Tensor, tau: Tensor
+) -> Tensor:
     """L_FM at each step (...,): the velocity at a_tau = (1 - tau) a_0 + tau a_1 against a_1 - a_0.
 
     action a_1 and noise a_0 (..., A); z and z_next (..., z_dim); tau (..., 1) in [0, 1].
@@ -293,7 +296,7 @@ def flow_matching_loss(
     return (velocity - (action - noise)).square().sum(-1)
 
 
-def belief_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
+def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """L_Total = -L_VAE + lambda L_FM and its terms, averaged over all steps of a batch of whole episodes."""
     h = encode_history(model["belief"].history, batch, args.bptt_steps)
     nll, kl, z, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
@@ -317,7 +320,7 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Ar
 class EpisodeDataset:
     """Whole episodes of dataset/ with u, time first; images on the GPU where they fit in half of its free memory."""
 
-    def __init__(self, dataset: Path, u: torch.Tensor, device: torch.device):
+    def __init__(self, dataset: Path, u: Tensor, device: torch.device):
         arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
         self.arrays = {name: x.to(device) for name, x in (*arrays.items(), ("u", u))}
         self.file, self.device, self.rgb = dataset / "rgb.npy", device, None
@@ -325,7 +328,7 @@ class EpisodeDataset:
         if device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
             self.rgb = torch.from_numpy(rgb).to(device)
 
-    def __call__(self, index: np.ndarray) -> dict[str, torch.Tensor]:
+    def __call__(self, index: np.ndarray) -> dict[str, Tensor]:
         """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
         if self.rgb is not None:
             rgb = self.rgb[index]
@@ -335,7 +338,7 @@ class EpisodeDataset:
         return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
 
 
-def shift_images(rgb: torch.Tensor, pixels: int, rng: np.random.Generator) -> None:
+def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
     """Roll each episode's images rgb (T, B, H, W, 3) in place by up to so many pixels (DrQ shifts image by image)."""
     shifts = rng.integers(-pixels, pixels, (rgb.shape[1], 2), endpoint=True)
     for images, shift in zip(rgb.unbind(1), shifts.tolist(), strict=True):
@@ -365,7 +368,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
 # ---------------------------------------------------------------- evaluation
 
 
-def probe_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: torch.Tensor) -> float:
+def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
     """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
 
     The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
@@ -381,9 +384,7 @@ def probe_score(x: torch.Tensor, y: torch.Tensor, x_test: torch.Tensor, y_test: 
 
 
 @torch.no_grad()
-def encode(
-    belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, index: np.ndarray
-) -> dict[str, torch.Tensor]:
+def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> dict[str, Tensor]:
     """What the belief makes of episodes index (E,).
 
     h (E, T+1, 256); u (E, T+1, u_dim), action (E, T, A), cue (E, K) as they were; z, z_mean (E, T+1, z_dim) of q(z|u,h)
@@ -407,7 +408,7 @@ def encode(
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-def probe_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) -> dict:
+def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
     """What the belief remembers, lists by time step.
 
     fit and test are encode's of two sets of episodes that the belief was not trained on: linear probes are fitted on
@@ -430,7 +431,7 @@ def probe_belief(fit: dict[str, torch.Tensor], test: dict[str, torch.Tensor]) ->
 
 
 @torch.no_grad()
-def flow_gain(head: nn.Module, z: torch.Tensor, action: torch.Tensor) -> tuple[float, float]:
+def flow_gain(head: nn.Module, z: Tensor, action: Tensor) -> tuple[float, float]:
     """L_FM, and how much larger it is with the z of other episodes; z (E, T+1, z_dim), action (E, T, A).
 
     With a gain near 0 the action head reads nothing from z, and so shapes nothing.
@@ -457,13 +458,15 @@ def main(args: Args) -> None:
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
-    config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints, "u_dim": stored["u_dim"]}
+    config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints}
+    config |= {"state_dim": len(stored["phi"]["mean"]), "u_dim": stored["u_dim"]}
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": AIBBelief(config, args.belief_amp)})
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     if args.action_head != "none":
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
         model["head"] = mlp([inputs, 256, action_dim])
+    model["belief"].phi.load_state_dict(stored["phi"])
     history = model["belief"].history
     if args.chrono_init:
         chrono_init(history.gru, len(sample["actions"]))
@@ -471,9 +474,6 @@ def main(args: Args) -> None:
         history.image_mean, history.image_std = stored["norm"]["image_mean"], stored["norm"]["image_std"]
     if args.history_joints:
         history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
-    # glibc keeps freed memory instead of asking for it anew: an update is a third faster on a CPU
-    ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
-    ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first = 0
@@ -522,7 +522,7 @@ def main(args: Args) -> None:
         report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
     writer.close()
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
-    content = {"kind": "aib_belief", **asdict(args), "config": config, "phi": stored["phi"]}
+    content = {"kind": "aib_belief", **asdict(args), "config": config}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
     known = [f"{name} {report[name][-1]:.2f}" for name in ("cue_from_u", "cue_from_particle", "u_r2_prior")]
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: {', '.join(known)}")
@@ -566,11 +566,10 @@ def check_run(args: Args) -> Path:
     """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     if (path / "args.json").exists() and not args.overwrite:
-        recorded = json.loads((path / "args.json").read_text())
-        given = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
-        changed = [
-            f"{name}={recorded.get(name)} there, {x} here" for name, x in given.items() if recorded.get(name) != x
-        ]
+        recorded, changed = json.loads((path / "args.json").read_text()), []
+        for name, value in asdict(args).items():
+            if name not in MAY_DIFFER and recorded.get(name) != value:
+                changed.append(f"{name}={recorded.get(name)} there, {value} here")
         if changed:
             fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
     return path
@@ -589,8 +588,7 @@ def open_run(path: Path, args: Args) -> None:
     if args.overwrite:
         for file in path.iterdir():
             shutil.rmtree(file) if file.is_dir() else file.unlink()
-    recorded = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
-    save(path / "args.json", json.dumps(recorded, indent=2).encode())
+    save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 
 
 def save(path: Path, content: dict | bytes) -> None:
@@ -608,12 +606,13 @@ def load(path: Path, hint: str, **expected: object) -> dict:
     """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
     if not path.exists():
         fail(f"{path} does not exist")
+    expected["format"] = FORMAT
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-        found = {name: content.get(name) for name in ("format", *expected)}
+        found = {name: content.get(name) for name in expected}
     except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
         fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
-    for name, value in {"format": FORMAT, **expected}.items():
+    for name, value in expected.items():
         if found[name] != value:
             fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
     return content

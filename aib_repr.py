@@ -7,12 +7,14 @@ Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events
 """
 
+import ctypes
 import difflib
 import fcntl
 import json
 import math
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import sys
@@ -34,19 +36,22 @@ import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
 import numpy as np
 import sapien
 import torch
-import torch.nn as nn
 import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+from sapien.render import RenderBodyComponent, RenderShapeTriangleMesh
+from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 6  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
+ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX; with the next line, glibc keeps freed memory for the next update
+ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
 # ---------------------------------------------------------------- arguments
@@ -138,7 +143,7 @@ class GaussianMLP(nn.Module):
         self.net = mlp([inputs, *hidden, 2 * size])
         self.min_std = min_std
 
-    def forward(self, x: torch.Tensor) -> Normal:
+    def forward(self, x: Tensor) -> Normal:
         mean, raw = self.net(x).chunk(2, -1)
         return Normal(mean, nn.functional.softplus(raw) + self.min_std, validate_args=False)
 
@@ -170,7 +175,7 @@ class NatureCNN(nn.Module):
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
         self.out = nn.Sequential(nn.Linear(flat, size), nn.ReLU())
 
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
+    def forward(self, images: Tensor) -> Tensor:
         with torch.autocast(images.device.type, torch.bfloat16, enabled=self.amp):
             return self.out(self.conv(images.permute(0, 3, 1, 2))).float()
 
@@ -184,7 +189,7 @@ class StateEncoder(nn.Module):
         self.register_buffer("std", torch.ones(state_dim))
         self.net = GaussianMLP(state_dim, [256, 256], u_dim, min_std=1e-5)
 
-    def forward(self, state: torch.Tensor) -> Normal:
+    def forward(self, state: Tensor) -> Normal:
         return self.net((state - self.mean) / self.std)
 
 
@@ -200,7 +205,7 @@ class ObservationEncoder(nn.Module):
         self.cnn = orthogonal_init(NatureCNN(image_shape, 256, amp))
         self.net = GaussianMLP(256 + joints_dim, [256, 256], u_dim, min_std=1e-5)
 
-    def forward(self, rgb: torch.Tensor, joints: torch.Tensor) -> Normal:
+    def forward(self, rgb: Tensor, joints: Tensor) -> Normal:
         image = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
         return self.net(torch.cat([image, (joints - self.joints_mean) / self.joints_std], -1))
 
@@ -215,7 +220,7 @@ class Predictor(nn.Module):
         self.register_buffer("reward_mean", torch.zeros(()))
         self.register_buffer("reward_std", torch.ones(()))
 
-    def forward(self, u_s: torch.Tensor, u_o: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(self, u_s: Tensor, u_o: Tensor, action: Tensor) -> tuple[Tensor, ...]:
         reward, next_u_s, next_u_o = self.net(torch.cat([u_s, u_o, action], -1)).split(self.heads, -1)
         return reward.squeeze(-1), next_u_s, next_u_o
 
@@ -223,7 +228,7 @@ class Predictor(nn.Module):
 # ---------------------------------------------------------------- losses
 
 
-def repr_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
+def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """The terms of Algorithm 1 for a batch of transitions (B, ...), each a mean over the batch."""
     phi, psi, g = model["phi"], model["psi"], model["g"]
     q_s, q_o = phi(batch["state"]), psi(batch["rgb"], batch["joints"])
@@ -272,17 +277,17 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     steps, (action_dim,) = gym.spec(args.env_id).max_episode_steps, envs.single_action_space.shape
     bar = tqdm(total=count * steps, initial=meta["episodes_done"] * steps, desc="random policy", unit="step")
     for first in range(meta["episodes_done"], count, envs.num_envs):
-        rows = np.arange(first, min(first + envs.num_envs, count))  # the episodes of this round
+        rows = np.arange(first, first + envs.num_envs) % count  # the last round is filled up with repetitions
         actions = np.stack([random_actions(args, episode, steps, action_dim) for episode in rows])
         seeds = (args.seed * 1_000_000 + rows) % 2**29 + 2**30  # above those of PPO's training, below its evaluation's
-        obs, info = envs.reset(seed=np.resize(seeds, envs.num_envs).tolist())
+        obs, info = envs.reset(seed=seeds.tolist())
         cue = info["cue"]  # at the start: in Rotate tasks it is what is left to turn
         buffer = defaultdict(list, rgb=[obs["rgb"]], joints=[obs["joints"]], state=[info["state"]])
         for t in range(steps):
-            obs, reward, _, _, info = envs.step(np.resize(actions[:, t], (envs.num_envs, action_dim)))
+            obs, reward, _, _, info = envs.step(actions[:, t])
             for name, x in (*obs.items(), ("state", info["state"]), ("rewards", reward), ("success", info["success"])):
                 buffer[name].append(x)
-            bar.update(len(rows))
+            bar.update(envs.num_envs)
         buffer = {name: torch.stack([torch.as_tensor(x) for x in xs], 1) for name, xs in buffer.items()}
         buffer |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue)}
         if not arrays:
@@ -293,15 +298,15 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
                 dtype, shape = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32), (count, *x.shape[1:])
                 arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, shape)
         for name, x in buffer.items():
-            arrays[name][rows] = x[: len(rows)].cpu()
-        meta["episodes_done"] = int(rows[-1]) + 1
+            arrays[name][rows] = x.cpu()
+        meta["episodes_done"] = min(first + envs.num_envs, count)
         save(path / "meta.json", json.dumps(meta, indent=2).encode())
     bar.close()
     envs.close()
     return arrays
 
 
-def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> dict[str, torch.Tensor]:
+def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> dict[str, Tensor]:
     """Transitions (s, o, a, r, s', o') number index (B,), counted through all episodes (line 3), each (B, ...)."""
     # opened anew each time, so that pages once read do not stay in this process
     arrays = {file.stem: np.load(file, mmap_mode="r") for file in dataset.glob("*.npy")}
@@ -424,7 +429,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
     def reset(self, **kwargs: object) -> tuple:
         return self._view(*self.env.reset(**kwargs))
 
-    def step(self, action: torch.Tensor) -> tuple:
+    def step(self, action: Tensor) -> tuple:
         obs_dict, reward, terminated, truncated, info = self.env.step(action)
         obs, info = self._view(obs_dict, info)
         return obs, reward, terminated, truncated, info
@@ -437,23 +442,37 @@ def shaders_without_brdf_table() -> Iterator[None]:
     with tempfile.TemporaryDirectory() as folder:
         pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
         for file in Path(pack).glob("*.frag"):
-            lines = [line for line in file.read_text().splitlines() if "sampler2D samplerBRDFLUT;" not in line]
-            text = "\n".join(lines).replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)")
-            file.write_text(text)
+            text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
+            file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
         sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
         yield
         sapien.render.set_camera_shader_dir = set_shader_dir
 
 
-def decimate_meshes(task: gym.Env, triangles: int) -> None:
-    """Draw the robot with about so many triangles per mesh; everything else is drawn as it is.
+def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
+    """Draw entities as meshes: (local pose, vertices, triangles, normals, texture coordinates, material)."""
+    for entity in entities:
+        body = RenderBodyComponent()
+        for local_pose, *arrays in meshes:
+            shape = RenderShapeTriangleMesh(*arrays)
+            shape.local_pose = local_pose
+            body.attach(shape)
+        entity.remove_component(entity.find_component_by_type(RenderBodyComponent))
+        entity.add_component(body)
 
-    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
+
+def decimate_meshes(task: gym.Env, triangles: int) -> None:
+    """Draw the robot with about so many triangles per mesh and the ground with two; objects are drawn as they are.
+
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground has
+    20,000, between 101 x 101 vertices in a plane: its corners draw the same picture.
     """
-    for entity in (link._objs[0].entity for link in task.agent.robot.get_links()):
-        old = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        new = sapien.render.RenderBodyComponent()
-        for shape in old.render_shapes if old else ():
+    for link in task.agent.robot.get_links():
+        entities, meshes = [body.entity for body in link._objs], []  # one per scene
+        old = entities[0].find_component_by_type(RenderBodyComponent)
+        if old is None:
+            continue
+        for shape in old.render_shapes:
             for part in shape.parts:
                 mesh = trimesh.Trimesh(part.vertices, part.triangles, process=False)
                 if len(mesh.faces) > triangles:
@@ -461,40 +480,35 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
                 arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))
-                decimated = sapien.render.RenderShapeTriangleMesh(*arrays, part.material)
-                decimated.local_pose = shape.local_pose
-                new.attach(decimated)
-        if old:
-            entity.add_component(new)
-            entity.remove_component(old)
-
-
-def flatten_ground(task: gym.Env) -> None:
-    """Draw the ground as two triangles instead of ManiSkill's 20,000 between 101 x 101 vertices: the same picture."""
-    for entity in task.scene.actors["ground"]._objs:
-        grid = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        part = grid.render_shapes[0].parts[0]
-        corners = [0, 100, -101, -1]
-        arrays = part.vertices[corners], [[0, 2, 3], [0, 3, 1]], part.get_vertex_normal()[corners]
-        plane = sapien.render.RenderBodyComponent()
-        plane.attach(sapien.render.RenderShapeTriangleMesh(*arrays, part.get_vertex_uv()[corners], part.material))
-        entity.remove_component(grid)
-        entity.add_component(plane)
+                meshes.append((shape.local_pose, *arrays, part.material))
+        replace_meshes(entities, meshes)
+    ground = task.scene.actors["ground"]._objs
+    part = ground[0].find_component_by_type(RenderBodyComponent).render_shapes[0].parts[0]
+    vertices, normals, uvs = (
+        x[[0, 100, -101, -1]] for x in (part.vertices, part.get_vertex_normal(), part.get_vertex_uv())
+    )
+    replace_meshes(ground, [(sapien.Pose(), vertices, [[0, 2, 3], [0, 3, 1]], normals, uvs, part.material)])
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     if multiprocessing.parent_process():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
-    modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
-    backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
-    modes["reconfiguration_freq"] = 0  # ShellGame tasks would build the scene, with stock meshes, at every reset
     with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
-        env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
+        env = gym.make(
+            args.env_id,
+            num_envs=num_scenes,
+            obs_mode="state_dict",
+            control_mode="pd_joint_delta_pos",
+            reward_mode="normalized_dense",
+            robot_uids=args.robot,
+            sim_backend=args.sim_backend,
+            render_backend=args.render_backend,
+            reconfiguration_freq=0,  # ShellGame tasks would build the scene, with stock meshes, at every reset
+        )
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
         if args.robot_triangles:
             decimate_meshes(env.unwrapped, args.robot_triangles)
-            flatten_ground(env.unwrapped)
         env = PrivilegedInfoWrapper(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
@@ -517,8 +531,6 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
-    if args.robot_triangles and args.sim_backend == "physx_cuda":
-        fail(f"--robot-triangles {args.robot_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         nearest = difflib.get_close_matches(args.env_id, tasks) or sorted(tasks)
@@ -574,11 +586,10 @@ def check_run(args: Args) -> Path:
     """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     if (path / "args.json").exists() and not args.overwrite:
-        recorded = json.loads((path / "args.json").read_text())
-        given = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
-        changed = [
-            f"{name}={recorded.get(name)} there, {x} here" for name, x in given.items() if recorded.get(name) != x
-        ]
+        recorded, changed = json.loads((path / "args.json").read_text()), []
+        for name, value in asdict(args).items():
+            if name not in MAY_DIFFER and recorded.get(name) != value:
+                changed.append(f"{name}={recorded.get(name)} there, {value} here")
         if changed:
             fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
     return path
@@ -597,8 +608,7 @@ def open_run(path: Path, args: Args) -> None:
     if args.overwrite:
         for file in path.iterdir():
             shutil.rmtree(file) if file.is_dir() else file.unlink()
-    recorded = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
-    save(path / "args.json", json.dumps(recorded, indent=2).encode())
+    save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 
 
 def save(path: Path, content: dict | bytes) -> None:
@@ -616,12 +626,13 @@ def load(path: Path, hint: str, **expected: object) -> dict:
     """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
     if not path.exists():
         fail(f"{path} does not exist")
+    expected["format"] = FORMAT
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-        found = {name: content.get(name) for name in ("format", *expected)}
+        found = {name: content.get(name) for name in expected}
     except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
         fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
-    for name, value in {"format": FORMAT, **expected}.items():
+    for name, value in expected.items():
         if found[name] != value:
             fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
     return content

@@ -17,6 +17,7 @@ import json
 import math
 import multiprocessing
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -42,22 +43,25 @@ import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
 import numpy as np
 import sapien
 import torch
-import torch.nn as nn
 import torch.utils.checkpoint
 import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+from sapien.render import RenderBodyComponent, RenderShapeTriangleMesh
+from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 5  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 6  # of every .pt file and of dataset/: raised when older scripts would misread newer files
 CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
+ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX; with the next line, glibc keeps freed memory for the next update
+ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
 # ---------------------------------------------------------------- arguments
@@ -200,7 +204,7 @@ class GaussianMLP(nn.Module):
         self.net = mlp([inputs, *hidden, 2 * size])
         self.min_std = min_std
 
-    def forward(self, x: torch.Tensor) -> Normal:
+    def forward(self, x: Tensor) -> Normal:
         mean, raw = self.net(x).chunk(2, -1)
         return Normal(mean, nn.functional.softplus(raw) + self.min_std, validate_args=False)
 
@@ -232,7 +236,7 @@ class NatureCNN(nn.Module):
         flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
         self.out = nn.Sequential(nn.Linear(flat, size), nn.ReLU())
 
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
+    def forward(self, images: Tensor) -> Tensor:
         with torch.autocast(images.device.type, torch.bfloat16, enabled=self.amp):
             return self.out(self.conv(images.permute(0, 3, 1, 2))).float()
 
@@ -246,7 +250,7 @@ class StateEncoder(nn.Module):
         self.register_buffer("std", torch.ones(state_dim))
         self.net = GaussianMLP(state_dim, [256, 256], u_dim, min_std=1e-5)
 
-    def forward(self, state: torch.Tensor) -> Normal:
+    def forward(self, state: Tensor) -> Normal:
         return self.net((state - self.mean) / self.std)
 
 
@@ -268,12 +272,12 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRU(inputs, 256, config["gru_layers"])
         self.out = mlp([256 + inputs, 256, 256])
 
-    def embed(self, rgb: torch.Tensor, joints: torch.Tensor) -> torch.Tensor:
+    def embed(self, rgb: Tensor, joints: Tensor) -> Tensor:
         """Images (B, H, W, 3) uint8 and joints (B, J) -> the GRU's input x (B, 512 + J), or (B, 512) without joints."""
         x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
-    def forward(self, x: torch.Tensor, hidden: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """x (T, B, .) of T steps that follow the GRU's state hidden (None: start) -> h (T, B, 256), hidden."""
         output, hidden = self.gru(x, hidden)
         return self.out(torch.cat([output, x], -1)), hidden
@@ -291,7 +295,7 @@ def chrono_init(gru: nn.GRU, steps: int) -> None:
 class BelieverBelief(nn.Module):
     """b(h) of Believer: history encoder, fixed prior N(0, I) and decoder p(u|z,h), all that acting needs.
 
-    config: image_shape [H, W, 3], joints_dim (0: none in the history), gru_layers, u_dim, z_dim.
+    config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -299,8 +303,9 @@ class BelieverBelief(nn.Module):
         self.config = config
         self.history = HistoryEncoder(config, amp)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # says what u is; only evaluations need it
 
-    def decode(self, h: torch.Tensor, z_noise: torch.Tensor) -> Normal:
+    def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """Give p(u|z_i,h) of z_i ~ N(0, I), i = 1..n: h (..., 256), noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
         return self.decoder(torch.cat([z_noise, h.unsqueeze(-2).expand(*z_noise.shape[:-1], -1)], -1))
 
@@ -320,7 +325,7 @@ class Agent(nn.Module):
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
         self.log_std = nn.Parameter(torch.full((action_dim,), math.log(init_std)))
 
-    def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
+    def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
         """Distribution of actions (B, A), value (B,): rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u)."""
         belief = self.w_agg(self.w_enc(obs["particles"]).mean(-2))
         x = torch.cat([self.cnn(obs["rgb"].float().div_(255)), self.joints(obs["joints"]), belief], -1)
@@ -331,7 +336,7 @@ class Agent(nn.Module):
 # ---------------------------------------------------------------- losses
 
 
-def encode_history(history: nn.Module, batch: dict[str, torch.Tensor], bptt_steps: int | None = None) -> torch.Tensor:
+def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int | None = None) -> Tensor:
     """h (T, B, 256) of whole episodes: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
 
     All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in chunks
@@ -352,7 +357,7 @@ def encode_history(history: nn.Module, batch: dict[str, torch.Tensor], bptt_step
     return torch.cat(outputs)
 
 
-def believer_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
+def believer_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """-ELBO with the fixed prior and its terms, averaged over all steps of a batch of whole episodes."""
     h = encode_history(model["belief"].history, batch, args.bptt_steps)
     q = model["posterior"](torch.cat([batch["u"], h], -1))
@@ -362,7 +367,7 @@ def believer_losses(model: nn.ModuleDict, batch: dict[str, torch.Tensor], args: 
     return {"nll": nll, "kl": kl, "total": nll + args.beta * kl}
 
 
-def compute_gae(rewards: torch.Tensor, values: torch.Tensor, gamma: float, gae_lambda: float) -> torch.Tensor:
+def compute_gae(rewards: Tensor, values: Tensor, gamma: float, gae_lambda: float) -> Tensor:
     """Generalised advantages (T, N) of whole episodes: rewards (T, N), values (T+1, N) with V(o_T) as the last."""
     advantages, last = torch.empty_like(rewards), torch.zeros_like(rewards[0])
     deltas = rewards + gamma * values[1:] - values[:-1]
@@ -371,7 +376,7 @@ def compute_gae(rewards: torch.Tensor, values: torch.Tensor, gamma: float, gae_l
     return advantages
 
 
-def ppo_losses(agent: nn.Module, batch: dict[str, torch.Tensor], args: Args) -> dict[str, torch.Tensor]:
+def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """PPO's clipped objective (Schulman et al., 2017) on a minibatch (B, ...), with advantages normalised in it."""
     dist, values = agent(batch)
     log_ratio = dist.log_prob(batch["actions"]).sum(-1) - batch["logprobs"]
@@ -398,7 +403,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, torch.Tensor], args: Args) -> 
 class EpisodeDataset:
     """Whole episodes of dataset/ with u, time first; images on the GPU where they fit in half of its free memory."""
 
-    def __init__(self, dataset: Path, u: torch.Tensor, device: torch.device):
+    def __init__(self, dataset: Path, u: Tensor, device: torch.device):
         arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
         self.arrays = {name: x.to(device) for name, x in (*arrays.items(), ("u", u))}
         self.file, self.device, self.rgb = dataset / "rgb.npy", device, None
@@ -406,7 +411,7 @@ class EpisodeDataset:
         if device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
             self.rgb = torch.from_numpy(rgb).to(device)
 
-    def __call__(self, index: np.ndarray) -> dict[str, torch.Tensor]:
+    def __call__(self, index: np.ndarray) -> dict[str, Tensor]:
         """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
         if self.rgb is not None:
             rgb = self.rgb[index]
@@ -416,7 +421,7 @@ class EpisodeDataset:
         return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
 
 
-def shift_images(rgb: torch.Tensor, pixels: int, rng: np.random.Generator) -> None:
+def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
     """Roll each episode's images rgb (T, B, H, W, 3) in place by up to so many pixels (DrQ shifts image by image)."""
     shifts = rng.integers(-pixels, pixels, (rgb.shape[1], 2), endpoint=True)
     for images, shift in zip(rgb.unbind(1), shifts.tolist(), strict=True):
@@ -453,7 +458,7 @@ def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator)
 @torch.no_grad()
 def rollout(
     envs: gym.vector.VectorEnv, agent: Agent, args: Args, seeds: np.ndarray, deterministic: bool = False
-) -> dict[str, torch.Tensor]:
+) -> dict[str, Tensor]:
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
     Returns arrays (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; and values (T+1, N),
@@ -471,15 +476,14 @@ def rollout(
     if not args.sample_decoder:
         u_noise.zero_()
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
-    name = "evaluation" if deterministic else "rollout"
-    bar = tqdm(total=steps * num_episodes, desc=name, unit="step", leave=False)
-    for first in range(0, num_episodes, envs.num_envs):
-        rows = slice(first, min(first + envs.num_envs, num_episodes))  # the episodes of this round
-        num_active = rows.stop - rows.start  # in the last round the other environments only repeat what these do
-        obs, info = envs.reset(seed=np.resize(seeds[rows], envs.num_envs).tolist())
+    rounds = range(0, num_episodes, envs.num_envs)
+    bar = tqdm(total=len(rounds) * steps, desc="rollout", unit="step", unit_scale=envs.num_envs, leave=False)
+    for first in rounds:
+        rows = np.arange(first, first + envs.num_envs) % num_episodes  # the last round is filled up with repetitions
+        obs, info = envs.reset(seed=seeds[rows].tolist())
         hidden = None
         for t in range(steps + 1):
-            step = {name: torch.as_tensor(obs[name][:num_active], device=device) for name in ("rgb", "joints")}
+            step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
             x = agent.belief.history.embed(step["rgb"], step["joints"])
             h, hidden = agent.belief.history(x[None], hidden)
             u = agent.belief.decode(h[0], z_noise[t, rows])
@@ -490,16 +494,15 @@ def rollout(
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
             step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
             if deterministic:
-                step["state"] = torch.as_tensor(info["state"][:num_active], device=device)
-            actions = step["actions"].clamp(-1, 1).cpu().numpy()
-            obs, rewards, _, _, info = envs.step(np.resize(actions, (envs.num_envs, action_dim)))
-            step["rewards"] = torch.as_tensor(rewards[:num_active], dtype=torch.float32, device=device)
-            step["success"] = torch.as_tensor(info["success"][:num_active], dtype=torch.float32, device=device)
+                step["state"] = torch.as_tensor(info["state"], device=device)
+            obs, rewards, _, _, info = envs.step(step["actions"].clamp(-1, 1).cpu().numpy())
+            step["rewards"] = torch.as_tensor(rewards, dtype=torch.float32, device=device)
+            step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
             for name, x in step.items():
                 if name not in buffer:
                     buffer[name] = torch.empty(steps, num_episodes, *x.shape[1:], dtype=x.dtype, device=device)
                 buffer[name][t, rows] = x
-            bar.update(num_active)
+            bar.update()
     bar.close()
     return buffer
 
@@ -508,9 +511,7 @@ def rollout(
 
 
 @torch.no_grad()
-def validate_belief(
-    belief: nn.Module, episodes: EpisodeDataset, index: np.ndarray
-) -> tuple[torch.Tensor, torch.Tensor]:
+def validate_belief(belief: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> tuple[Tensor, Tensor]:
     """u and mean particle, both (T+1, E, u_dim), of episodes index (E,) that the belief is not trained on."""
     torch.manual_seed(0)  # the same noise every time, so that errors compare
     u, estimate = [], []
@@ -523,7 +524,7 @@ def validate_belief(
     return torch.cat(u, 1), torch.cat(estimate, 1)
 
 
-def success_and_return(buffer: dict[str, torch.Tensor]) -> dict[str, float]:
+def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
     """success_once, success_at_end (paper, appendix A) and return of a rollout, means over its episodes."""
     return {
         "success_once": buffer["success"].amax(0).mean().item(),
@@ -532,24 +533,22 @@ def success_and_return(buffer: dict[str, torch.Tensor]) -> dict[str, float]:
     }
 
 
-def make_video(buffer: dict[str, torch.Tensor]) -> bytes:
-    """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green frame marks success."""
+def make_video(buffer: dict[str, Tensor]) -> bytes:
+    """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
     rgb = buffer["rgb"][:, :4].cpu().numpy().repeat(2, 2).repeat(2, 3)
-    edge = np.ones(rgb.shape[2:4], bool)
-    edge[6:-6, 6:-6] = False
-    succeeded = buffer["success"][:-1, :4].cpu().numpy() > 0.5  # after step t: what frame t + 1 shows
-    rgb[1:][succeeded[:, :, None, None] & edge] = (0, 255, 0)
-    rgb = np.concatenate(list(rgb.swapaxes(0, 1)), axis=2)
+    succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
+    rgb[1:, :, :8][succeeded] = (0, 255, 0)
+    rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1)
 
 
-def r_squared(u: torch.Tensor, estimate: torch.Tensor) -> float:
+def r_squared(u: Tensor, estimate: Tensor) -> float:
     """R2 of u (M, u_dim) from its estimate: 1 if that is u, 0 if it is no better than the mean of u."""
     return 1 - ((u - estimate).square().sum() / (u - u.mean(0)).square().sum()).item()
 
 
 @torch.no_grad()
-def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args, phi: StateEncoder) -> tuple[dict[str, float], bytes]:
+def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
     u_r2, u_r2_at_end: what the belief knows where its agent takes it, R2 of u = phi(s) from the mean particle, over all
@@ -557,7 +556,7 @@ def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args, phi: StateEnc
     """
     torch.manual_seed(0)
     buffer = rollout(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), deterministic=True)
-    u, estimate = phi(buffer["state"]).mean, buffer["particles"].mean(-2)
+    u, estimate = agent.belief.phi(buffer["state"]).mean, buffer["particles"].mean(-2)
     metrics = success_and_return(buffer)
     metrics["u_r2"] = r_squared(u.flatten(0, 1), estimate.flatten(0, 1))
     metrics["u_r2_at_end"] = r_squared(u[-1], estimate[-1])
@@ -573,10 +572,12 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
     train, held_out = np.split(np.arange(args.num_episodes), [-stored["num_val"]])
     sample = episodes(train[:1])
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
-    config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints, "u_dim": stored["u_dim"]}
+    config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints}
+    config |= {"state_dim": len(stored["phi"]["mean"]), "u_dim": stored["u_dim"]}
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": BelieverBelief(config, args.belief_amp)})
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
+    model["belief"].phi.load_state_dict(stored["phi"])
     history = model["belief"].history
     if args.chrono_init:
         chrono_init(history.gru, len(sample["actions"]))
@@ -584,9 +585,6 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
         history.image_mean, history.image_std = stored["norm"]["image_mean"], stored["norm"]["image_std"]
     if args.history_joints:
         history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
-    # glibc keeps freed memory instead of asking for it anew: an update is a third faster on a CPU
-    ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
-    ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     first = 0
@@ -626,8 +624,8 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
 
     # the last weights: held-out error and likelihood are best before the belief remembers
     writer.close()
-    content = {"kind": "believer_belief", "config": config, "phi": stored["phi"]}
-    save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
+    content = {"kind": "believer_belief", "config": config, "belief": model["belief"].state_dict()}
+    save(path / "belief.pt", content)
     known = r_squared(*(x[-1] for x in validate_belief(model["belief"], episodes, held_out)))
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {known:.2f}")
 
@@ -643,10 +641,8 @@ def evaluate_checkpoint(args: Args) -> None:
     (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     belief = BelieverBelief(stored["config"], args.amp)
     agent = Agent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
-    phi = StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"]).to(device)
-    phi.load_state_dict(stored["phi"])
     agent.load_state_dict(stored["agent"])
-    metrics, video = evaluate(envs, agent, args, phi)
+    metrics, video = evaluate(envs, agent, args)
     save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
     save(file.with_name("evaluation.mp4"), video)
     print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
@@ -679,8 +675,6 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     belief = BelieverBelief(stored["config"], args.amp)
     agent = Agent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
-    phi = StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"]).to(device)
-    phi.load_state_dict(stored["phi"])
     agent.belief.load_state_dict(stored["belief"])
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
@@ -726,15 +720,14 @@ def main(args: Args) -> None:
         del buffer, batch, losses  # a gigabyte of images and a graph: not two at a time
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
-            metrics, video = evaluate(envs, agent, args, phi)
+            metrics, video = evaluate(envs, agent, args)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
             lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"config": stored["config"], "phi": stored["phi"], "agent": agent.state_dict()}
-            content |= {"kind": "ppo_believer agent", "global_step": global_step}
-            save(path / "agent.pt", {**asdict(args), **content})
+            content = {"kind": "ppo_believer agent", **asdict(args), "config": stored["config"]}
+            save(path / "agent.pt", {**content, "global_step": global_step, "agent": agent.state_dict()})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
 
         for name, value in scalars.items():
@@ -787,7 +780,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
     def reset(self, **kwargs: object) -> tuple:
         return self._view(*self.env.reset(**kwargs))
 
-    def step(self, action: torch.Tensor) -> tuple:
+    def step(self, action: Tensor) -> tuple:
         obs_dict, reward, terminated, truncated, info = self.env.step(action)
         obs, info = self._view(obs_dict, info)
         return obs, reward, terminated, truncated, info
@@ -800,23 +793,37 @@ def shaders_without_brdf_table() -> Iterator[None]:
     with tempfile.TemporaryDirectory() as folder:
         pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
         for file in Path(pack).glob("*.frag"):
-            lines = [line for line in file.read_text().splitlines() if "sampler2D samplerBRDFLUT;" not in line]
-            text = "\n".join(lines).replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)")
-            file.write_text(text)
+            text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
+            file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
         sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
         yield
         sapien.render.set_camera_shader_dir = set_shader_dir
 
 
-def decimate_meshes(task: gym.Env, triangles: int) -> None:
-    """Draw the robot with about so many triangles per mesh; everything else is drawn as it is.
+def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
+    """Draw entities as meshes: (local pose, vertices, triangles, normals, texture coordinates, material)."""
+    for entity in entities:
+        body = RenderBodyComponent()
+        for local_pose, *arrays in meshes:
+            shape = RenderShapeTriangleMesh(*arrays)
+            shape.local_pose = local_pose
+            body.attach(shape)
+        entity.remove_component(entity.find_component_by_type(RenderBodyComponent))
+        entity.add_component(body)
 
-    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
+
+def decimate_meshes(task: gym.Env, triangles: int) -> None:
+    """Draw the robot with about so many triangles per mesh and the ground with two; objects are drawn as they are.
+
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground has
+    20,000, between 101 x 101 vertices in a plane: its corners draw the same picture.
     """
-    for entity in (link._objs[0].entity for link in task.agent.robot.get_links()):
-        old = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        new = sapien.render.RenderBodyComponent()
-        for shape in old.render_shapes if old else ():
+    for link in task.agent.robot.get_links():
+        entities, meshes = [body.entity for body in link._objs], []  # one per scene
+        old = entities[0].find_component_by_type(RenderBodyComponent)
+        if old is None:
+            continue
+        for shape in old.render_shapes:
             for part in shape.parts:
                 mesh = trimesh.Trimesh(part.vertices, part.triangles, process=False)
                 if len(mesh.faces) > triangles:
@@ -824,40 +831,35 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
                 arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))
-                decimated = sapien.render.RenderShapeTriangleMesh(*arrays, part.material)
-                decimated.local_pose = shape.local_pose
-                new.attach(decimated)
-        if old:
-            entity.add_component(new)
-            entity.remove_component(old)
-
-
-def flatten_ground(task: gym.Env) -> None:
-    """Draw the ground as two triangles instead of ManiSkill's 20,000 between 101 x 101 vertices: the same picture."""
-    for entity in task.scene.actors["ground"]._objs:
-        grid = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        part = grid.render_shapes[0].parts[0]
-        corners = [0, 100, -101, -1]
-        arrays = part.vertices[corners], [[0, 2, 3], [0, 3, 1]], part.get_vertex_normal()[corners]
-        plane = sapien.render.RenderBodyComponent()
-        plane.attach(sapien.render.RenderShapeTriangleMesh(*arrays, part.get_vertex_uv()[corners], part.material))
-        entity.remove_component(grid)
-        entity.add_component(plane)
+                meshes.append((shape.local_pose, *arrays, part.material))
+        replace_meshes(entities, meshes)
+    ground = task.scene.actors["ground"]._objs
+    part = ground[0].find_component_by_type(RenderBodyComponent).render_shapes[0].parts[0]
+    vertices, normals, uvs = (
+        x[[0, 100, -101, -1]] for x in (part.vertices, part.get_vertex_normal(), part.get_vertex_uv())
+    )
+    replace_meshes(ground, [(sapien.Pose(), vertices, [[0, 2, 3], [0, 3, 1]], normals, uvs, part.material)])
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
     if multiprocessing.parent_process():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
-    modes = dict(obs_mode="state_dict", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
-    backends = dict(sim_backend=args.sim_backend, render_backend=args.render_backend)
-    modes["reconfiguration_freq"] = 0  # ShellGame tasks would build the scene, with stock meshes, at every reset
     with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
-        env = gym.make(args.env_id, num_envs=num_scenes, robot_uids=args.robot, **modes, **backends)
+        env = gym.make(
+            args.env_id,
+            num_envs=num_scenes,
+            obs_mode="state_dict",
+            control_mode="pd_joint_delta_pos",
+            reward_mode="normalized_dense",
+            robot_uids=args.robot,
+            sim_backend=args.sim_backend,
+            render_backend=args.render_backend,
+            reconfiguration_freq=0,  # ShellGame tasks would build the scene, with stock meshes, at every reset
+        )
         env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
         if args.robot_triangles:
             decimate_meshes(env.unwrapped, args.robot_triangles)
-            flatten_ground(env.unwrapped)
         env = PrivilegedInfoWrapper(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
@@ -880,8 +882,6 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 def check_task(args: Args) -> None:
     """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
-    if args.robot_triangles and args.sim_backend == "physx_cuda":
-        fail(f"--robot-triangles {args.robot_triangles} needs --sim-backend physx_cpu; on physx_cuda it must be 0")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         nearest = difflib.get_close_matches(args.env_id, tasks) or sorted(tasks)
@@ -937,11 +937,10 @@ def check_run(args: Args) -> Path:
     """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     if (path / "args.json").exists() and not args.overwrite:
-        recorded = json.loads((path / "args.json").read_text())
-        given = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
-        changed = [
-            f"{name}={recorded.get(name)} there, {x} here" for name, x in given.items() if recorded.get(name) != x
-        ]
+        recorded, changed = json.loads((path / "args.json").read_text()), []
+        for name, value in asdict(args).items():
+            if name not in MAY_DIFFER and recorded.get(name) != value:
+                changed.append(f"{name}={recorded.get(name)} there, {value} here")
         if changed:
             fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
     return path
@@ -960,8 +959,7 @@ def open_run(path: Path, args: Args) -> None:
     if args.overwrite:
         for file in path.iterdir():
             shutil.rmtree(file) if file.is_dir() else file.unlink()
-    recorded = {name: value for name, value in asdict(args).items() if name not in MAY_DIFFER}
-    save(path / "args.json", json.dumps(recorded, indent=2).encode())
+    save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 
 
 def save(path: Path, content: dict | bytes) -> None:
@@ -979,12 +977,13 @@ def load(path: Path, hint: str, **expected: object) -> dict:
     """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
     if not path.exists():
         fail(f"{path} does not exist")
+    expected["format"] = FORMAT
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-        found = {name: content.get(name) for name in ("format", *expected)}
+        found = {name: content.get(name) for name in expected}
     except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
         fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
-    for name, value in {"format": FORMAT, **expected}.items():
+    for name, value in expected.items():
         if found[name] != value:
             fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
     return content

@@ -36,7 +36,7 @@ import belief  # noqa: E402
 import ppo_aib  # noqa: E402
 import ppo_baseline  # noqa: E402
 
-CONFIG = {"image_shape": [128, 128, 3], "joints_dim": 0, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
+CONFIG = {"image_shape": [128, 128, 3], "joints_dim": 0, "state_dim": 16, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
 
 
 @dataclass

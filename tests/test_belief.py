@@ -84,7 +84,9 @@ def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_
     assert [episodes for episodes, _ in looks] == [test] * 3 + [fit, test]
     stored = torch.load(path / "belief.pt", weights_only=True)
     phi = torch.load(Path(repr_dir) / "repr.pt", weights_only=True)["phi"]
-    assert all(torch.equal(stored["phi"][name], x) for name, x in phi.items()), "PPO's evaluation needs it for u"
+    assert all(torch.equal(stored["belief"][f"phi.{name}"], x) for name, x in phi.items()), (
+        "PPO's evaluation needs it for u"
+    )
     stored = stored["belief"]
     assert all(torch.equal(stored[name], x) for name, x in looks[2][1].items())  # the last weights
     assert any((stored[name] != x).any() for name, x in looks[1][1].items())

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -137,12 +138,38 @@ def test_the_ground_of_two_triangles_gives_the_same_picture(monkeypatch: pytest.
     flat = aib_repr.make_task(aib_repr.Args(env_id=TASK), 1)
     body = flat.unwrapped.scene.actors["ground"]._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
     assert len(body.render_shapes[0].parts[0].triangles) == 2
-    monkeypatch.setattr(aib_repr, "flatten_ground", lambda task: None)
+    replace_meshes = aib_repr.replace_meshes
+
+    def of_the_robot_only(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
+        if len(meshes[0][2]) > 2:  # triangles
+            replace_meshes(entities, meshes)
+
+    monkeypatch.setattr(aib_repr, "replace_meshes", of_the_robot_only)
     grid = aib_repr.make_task(aib_repr.Args(env_id=TASK), 1)
     pictures, expected = (env.reset(seed=1)[0]["rgb"].astype(int) for env in (flat, grid))
     assert np.abs(pictures - expected).max() <= 1
     flat.close()
     grid.close()
+
+
+def test_every_scene_of_a_batch_gets_the_decimated_meshes() -> None:
+    """As on physx_cuda, where a link has one body per scene: here those of two environments."""
+    envs = [aib_repr.make_task(aib_repr.Args(env_id=TASK, robot_triangles=0), 1) for _ in range(2)]
+    links = zip(*(env.unwrapped.agent.robot.get_links() for env in envs), strict=True)
+    batch = [SimpleNamespace(_objs=[link._objs[0] for link in pair]) for pair in links]
+    ground = [env.unwrapped.scene.actors["ground"]._objs[0] for env in envs]
+    robot = SimpleNamespace(get_links=lambda: batch)
+    scene = SimpleNamespace(actors={"ground": SimpleNamespace(_objs=ground)})
+    aib_repr.decimate_meshes(SimpleNamespace(agent=SimpleNamespace(robot=robot), scene=scene), 500)
+    for link in batch:
+        for body in link._objs:
+            drawn = body.entity.find_component_by_type(sapien.render.RenderBodyComponent)
+            for shape in drawn.render_shapes if drawn else ():
+                assert all(len(part.triangles) <= 500 for part in shape.parts)
+    first, second = (env.reset(seed=1)[0]["rgb"].astype(int) for env in envs)
+    assert np.abs(first - second).max() <= 1
+    for env in envs:
+        env.close()
 
 
 def test_random_actions_are_uniform_at_every_step_whatever_their_colour() -> None:

@@ -55,12 +55,6 @@ def test_no_rendering_device(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_decimated_meshes_only_where_there_is_one_scene_per_process(capsys: pytest.CaptureFixture) -> None:
-    with pytest.raises(SystemExit) as stop:
-        ppo_aib.check_task(ppo_aib.Args(sim_backend="physx_cuda", robot_triangles=500))
-    refused((stop.value.code, *capsys.readouterr()), "--robot-triangles 500", "physx_cpu")
-
-
 def test_physx_without_its_library(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     def enable_gpu() -> None:
         raise OSError("libcuda.so: cannot open shared object file")

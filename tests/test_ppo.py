@@ -104,22 +104,22 @@ def test_u_r2_tells_what_the_belief_knows_of_the_episodes_just_played(
     module, arguments = SCRIPTS[script], small(SCRIPTS[script], toy_stages, num_eval_episodes=16)
     args = module.Args(env_id=TOY, **arguments)
     stored = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)
-    phi = module.StateEncoder(len(stored["phi"]["mean"]), stored["config"]["u_dim"])
-    phi.load_state_dict(stored["phi"])
+    belief = (ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief)(stored["config"])
+    phi = {name.removeprefix("phi."): x for name, x in stored["belief"].items() if name.startswith("phi.")}
+    belief.phi.load_state_dict(phi)
     played, rollout = [], module.rollout
 
     def informed(*arguments: object, deterministic: bool) -> dict[str, torch.Tensor]:
         data = rollout(*arguments, deterministic=deterministic)
-        u = phi(data["state"]).mean
+        u = belief.phi(data["state"]).mean
         error = size * (u - u.mean((0, 1))).square().mean((0, 1)).sqrt() * torch.randn_like(u)
         played.append(data)
         return {**data, "particles": (u + error)[:, :, None].expand(-1, -1, 30, -1)}
 
     monkeypatch.setattr(module, "rollout", informed)
-    belief = ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief
-    agent = module.Agent(belief(stored["config"]), 3, 2, 0.6)
+    agent = module.Agent(belief, 3, 2, 0.6)
     for size, expected in ((0.0, 1.0), (0.5**0.5, 0.5)):  # noqa: B007  (informed reads it)
-        metrics, _ = module.evaluate(toy.make_envs(args), agent, args, phi)
+        metrics, _ = module.evaluate(toy.make_envs(args), agent, args)
         assert metrics["u_r2"] == pytest.approx(expected, abs=0.1)
     assert list(metrics)[-2:] == ["u_r2", "u_r2_at_end"] and metrics["u_r2_at_end"] < 1
     envs = toy.make_envs(args)
