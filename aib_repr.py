@@ -106,12 +106,14 @@ class Args:
     """lambda_s"""
     obs_coef: float = 0.03
     """lambda_o"""
-    kl_coef: float = 0.003
-    """lambda_KL; the paper's 0.03, summed over u's dimensions, leaves too little of the cue in u"""
+    kl_coef: float = 0.03
+    """lambda_KL; with less, u says where the target is in another way for each cue, and PPO learns more slowly"""
     reward_norm: bool = True
     """standardise rewards; without it the reward term of a random policy is next to nothing"""
     kl_reduction: Literal["sum", "mean"] = "sum"
     """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
+    psi_images: bool = True
+    """psi sees image and joints, as in the paper; without images this stage takes a CPU minutes instead of an hour"""
     amp: bool = BFLOAT16
     """image network in bfloat16"""
 
@@ -120,7 +122,8 @@ class Args:
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), val_fraction=(0, 1), noise_beta=(0, 2))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
-SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, epochs=7, batch_size=100, learning_rate=1e-3)
+SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, batch_size=100, learning_rate=1e-3)
+SMALL |= dict(epochs=20, psi_images=False)
 QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_fraction=0.5, epochs=2)
 
 
@@ -194,20 +197,25 @@ class StateEncoder(nn.Module):
 
 
 class ObservationEncoder(nn.Module):
-    """psi: rgb (B, H, W, 3) uint8 and joints (B, J), standardised inside, -> Normal over u^o (B, u_dim) (paper 3.1)."""
+    """psi: rgb (B, H, W, 3) uint8 and joints (B, J), standardised inside, -> Normal over u^o (B, u_dim) (paper 3.1).
 
-    def __init__(self, image_shape: list[int], joints_dim: int, u_dim: int, amp: bool = False):
+    images: False for a psi of the joints alone, which is many times faster on a CPU; rgb may then be None.
+    """
+
+    def __init__(self, image_shape: list[int], joints_dim: int, u_dim: int, images: bool = True, amp: bool = False):
         super().__init__()
         self.register_buffer("image_mean", torch.zeros(image_shape))
         self.register_buffer("image_std", torch.tensor(255.0))
         self.register_buffer("joints_mean", torch.zeros(joints_dim))
         self.register_buffer("joints_std", torch.ones(joints_dim))
-        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, amp))
-        self.net = GaussianMLP(256 + joints_dim, [256, 256], u_dim, min_std=1e-5)
+        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, amp)) if images else None
+        self.net = GaussianMLP(joints_dim + (256 if images else 0), [256, 256], u_dim, min_std=1e-5)
 
     def forward(self, rgb: Tensor, joints: Tensor) -> Normal:
-        image = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
-        return self.net(torch.cat([image, (joints - self.joints_mean) / self.joints_std], -1))
+        x = (joints - self.joints_mean) / self.joints_std
+        if self.cnn:
+            x = torch.cat([self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std)), x], -1)
+        return self.net(x)
 
 
 class Predictor(nn.Module):
@@ -231,10 +239,10 @@ class Predictor(nn.Module):
 def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """The terms of Algorithm 1 for a batch of transitions (B, ...), each a mean over the batch."""
     phi, psi, g = model["phi"], model["psi"], model["g"]
-    q_s, q_o = phi(batch["state"]), psi(batch["rgb"], batch["joints"])
+    q_s, q_o = phi(batch["state"]), psi(batch.get("rgb"), batch["joints"])
     r_hat, s_hat, o_hat = g(q_s.rsample(), q_o.rsample(), batch["actions"])  # lines 4 and 5
     with torch.no_grad():  # line 6; the mean of a target gives the gradient of a sample with less noise
-        s_next, o_next = phi(batch["next_state"]).mean, psi(batch["next_rgb"], batch["next_joints"]).mean
+        s_next, o_next = phi(batch["next_state"]).mean, psi(batch.get("next_rgb"), batch["next_joints"]).mean
     reward = ((batch["rewards"] - g.reward_mean) / g.reward_std - r_hat).square().mean()  # line 7
     state = (s_next - s_hat).square().sum(-1).mean()  # line 8
     obs = (o_next - o_hat).square().sum(-1).mean()  # line 9
@@ -306,13 +314,14 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-def read_transitions(dataset: Path, index: np.ndarray, device: torch.device) -> dict[str, Tensor]:
+def read_transitions(dataset: Path, index: np.ndarray, images: bool, device: torch.device) -> dict[str, Tensor]:
     """Transitions (s, o, a, r, s', o') number index (B,), counted through all episodes (line 3), each (B, ...)."""
     # opened anew each time, so that pages once read do not stay in this process
     arrays = {file.stem: np.load(file, mmap_mode="r") for file in dataset.glob("*.npy")}
     episode, t = np.divmod(index, arrays["actions"].shape[1])
-    batch = {name: arrays[name][episode, t] for name in ("rgb", "joints", "state", "actions", "rewards")}
-    batch |= {f"next_{name}": arrays[name][episode, t + 1] for name in ("rgb", "joints", "state")}
+    observed = ("rgb", "joints", "state") if images else ("joints", "state")
+    batch = {name: arrays[name][episode, t] for name in (*observed, "actions", "rewards")}
+    batch |= {f"next_{name}": arrays[name][episode, t + 1] for name in observed}
     return {name: torch.from_numpy(x).to(device) for name, x in batch.items()}
 
 
@@ -337,7 +346,9 @@ def main(args: Args) -> None:
 
     torch.manual_seed(args.seed)
     phi = StateEncoder(arrays["state"].shape[-1], args.u_dim)
-    psi = ObservationEncoder(list(arrays["rgb"].shape[2:]), arrays["joints"].shape[-1], args.u_dim, args.amp)
+    psi = ObservationEncoder(
+        list(arrays["rgb"].shape[2:]), arrays["joints"].shape[-1], args.u_dim, args.psi_images, args.amp
+    )
     g = Predictor(args.u_dim, action_dim)
     for mean, std, x in ((phi.mean, phi.std, train["state"]), (psi.joints_mean, psi.joints_std, train["joints"])):
         mean.copy_(torch.from_numpy(x.mean((0, 1), dtype=np.float64)))
@@ -366,7 +377,7 @@ def main(args: Args) -> None:
         torch.manual_seed(args.seed * 1_000_000 + epoch)  # so that a resumed run repeats the epoch
         order = np.random.default_rng([args.seed, epoch]).permutation(transitions)
         for index in np.array_split(order, per_epoch):
-            losses = repr_losses(model, read_transitions(dataset, index, device), args)
+            losses = repr_losses(model, read_transitions(dataset, index, args.psi_images, device), args)
             optimizer.zero_grad()
             losses["total"].backward()
             nn.utils.clip_grad_norm_(model.parameters(), math.inf, error_if_nonfinite=True)  # only stops at NaN
@@ -374,7 +385,8 @@ def main(args: Args) -> None:
             bar.update()
 
         with torch.no_grad():
-            val_batch = read_transitions(dataset, held_out[:: len(held_out) // 1000 + 1], device)
+            val_inds = held_out[:: len(held_out) // 1000 + 1]
+            val_batch = read_transitions(dataset, val_inds, args.psi_images, device)
             val_losses = repr_losses(model, val_batch, args)
             active = (phi(val_batch["state"]).mean.std(0) > 0.1).sum()
         update = (epoch + 1) * per_epoch

@@ -104,7 +104,7 @@ def test_transitions_lie_within_an_episode_and_each_is_learnt_from_once_an_epoch
 ) -> None:
     dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
     arrays = {file.stem: np.load(file) for file in dataset.glob("*.npy")}
-    batch = aib_repr.read_transitions(dataset, np.array([0, 9, 10, 199]), torch.device("cpu"))
+    batch = aib_repr.read_transitions(dataset, np.array([0, 9, 10, 199]), True, torch.device("cpu"))
     for row, (episode, t) in enumerate([(0, 0), (0, 9), (1, 0), (19, 9)]):
         for name in ("rgb", "joints", "state", "actions", "rewards"):
             assert np.array_equal(batch[name][row], arrays[name][episode, t]), name
