@@ -1,12 +1,13 @@
 """How far would a perfect belief get? PPO as in ppo_baseline.py, on joints and the true privileged state, no pictures.
 
-Tells a belief that fails from a budget that is too small, at several times the speed. With --phi the policy sees u in
-place of the state: what a belief is trained to know, where the state is facts that have to be put together first.
+Tells a belief that fails from a budget that is too small, at several times the speed. In place of the state the policy
+sees u with --phi, what a belief is trained to know, or with --target the target position of a Remember task.
 
 Usage:   python benchmark/true_state.py --env-id RememberColor5-v0 --small
          python benchmark/true_state.py --env-id RememberColor5-v0 --small --phi 'runs/{env_id}__aib_repr_small__{seed}'
+         python benchmark/true_state.py --env-id RememberColor5-v0 --small --target
 Takes:   the arguments of ppo_baseline.py; always simulates on the CPU
-Writes:  runs/{env_id}__true_state__{seed}/ (true_u with --phi; or …_small), as ppo_baseline.py does; empty videos
+Writes:  runs/{env_id}__true_state__{seed}/ (true_u, true_target; or …_small), as ppo_baseline.py does; empty videos
 """
 
 import math
@@ -32,26 +33,35 @@ from ppo_baseline import orthogonal_init  # noqa: E402
 class Args(ppo_baseline.Args):
     phi: str | None = None
     """run directory of stage 1, whose state encoder turns the state into u; None: the state itself"""
+    target: bool = False
+    """the target position in place of the state; only in Remember tasks, whose state is the cue and object positions"""
 
 
 class ShowState(gym.Wrapper):
     """Joints (25 + D,) float32 with the privileged state at their end; rgb is one black pixel, nothing is drawn."""
 
-    def __init__(self, env: gym.Env):
+    def __init__(self, env: gym.Env, target: bool = False):
         super().__init__(env)
+        self.target = target
         black = {"base_camera": {"rgb": torch.zeros(1, 1, 1, 3, dtype=torch.uint8)}}
         env.unwrapped._get_obs_sensor_data = lambda: black
         size = self.reset()[0]["joints"].shape
         spaces = {"rgb": gym.spaces.Box(0, 255, (1, 1, 3), np.uint8), "joints": gym.spaces.Box(-np.inf, np.inf, size)}
         self.observation_space = gym.spaces.Dict(spaces)
 
+    def _show(self, obs: dict, info: dict) -> dict:
+        shown = info["state"]
+        if self.target:  # the state holds a position per object, zeros but for the target's
+            shown = shown[len(info["cue"]) :].reshape(-1, 3).sum(0)
+        return {**obs, "joints": np.append(obs["joints"], shown)}
+
     def reset(self, **kwargs: object) -> tuple:
         obs, info = self.env.reset(**kwargs)
-        return {**obs, "joints": np.append(obs["joints"], info["state"])}, info
+        return self._show(obs, info), info
 
     def step(self, action: np.ndarray) -> tuple:
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return {**obs, "joints": np.append(obs["joints"], info["state"])}, reward, terminated, truncated, info
+        return self._show(obs, info), reward, terminated, truncated, info
 
 
 class StateAgent(nn.Module):
@@ -88,7 +98,7 @@ class StateAgent(nn.Module):
 def make_envs(args: ppo_baseline.Args) -> gym.vector.VectorEnv:
     """Up to args.num_workers processes of one scene each, all episodes of max_episode_steps, no auto-reset."""
     os.environ.update(OMP_NUM_THREADS="1")  # of the workers
-    workers = [lambda: ShowState(ppo_baseline.make_task(args, 1))] * min(args.num_workers, args.num_envs)
+    workers = [lambda: ShowState(ppo_baseline.make_task(args, 1), args.target)] * min(args.num_workers, args.num_envs)
     return gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
 
 
@@ -107,6 +117,6 @@ if __name__ == "__main__":
     phi = load_phi(args) if args.phi else None
     ppo_baseline.Agent, ppo_baseline.make_envs = partial(StateAgent, phi=phi), make_envs
     ppo_baseline.make_video = lambda data: b""
-    name = "true_u" if phi else "true_state"
+    name = "true_target" if args.target else "true_u" if phi else "true_state"
     args.exp_name, args.sim_backend = args.exp_name.replace("ppo_baseline", name), "physx_cpu"
     ppo_baseline.main(args)

@@ -103,6 +103,12 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
     first = agent({"joints": joints})[1]
     phi.mean[-1] += 1  # now the second state is to phi what the first was
     assert torch.allclose(agent({"joints": joints})[1][1], first[0]), "it sees u"
+    shown = true_state.ShowState(env, target=True)
+    shown.reset(seed=3)
+    for _ in range(12):  # until the objects stand on the table
+        obs, *_ = shown.step(np.zeros(8, np.float32))
+    tcp, target = obs["joints"][18:21], obs["joints"][25:]
+    assert np.allclose(target - tcp, env.unwrapped.obj_to_goal_pos, atol=1e-4)
     del env.unwrapped._get_obs_sensor_data
 
 
