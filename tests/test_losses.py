@@ -314,6 +314,20 @@ def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_
     assert gate.min() > -0.1 and 1 < gate.max() < math.log(9) + 0.1, "chrono_init, and three updates"
 
 
+def test_psi_without_images_sees_the_joints_alone(toy_stages: Path) -> None:
+    psi = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4, images=False)
+    assert not any("cnn" in name for name, _ in psi.named_parameters())
+    q, other = psi(None, torch.zeros(2, 7)), psi(None, torch.ones(2, 7))
+    assert q.mean.shape == (2, 4) and not torch.allclose(q.mean, other.mean)
+    dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
+    batch = aib_repr.read_transitions(dataset, np.array([3, 4]), False, torch.device("cpu"))
+    assert set(batch) == {"joints", "state", "actions", "rewards", "next_joints", "next_state"}
+    psi = aib_repr.ObservationEncoder(tuple(IMAGE), 3, 4, images=False)
+    model = nn.ModuleDict({"phi": aib_repr.StateEncoder(4, 4), "psi": psi, "g": aib_repr.Predictor(4, 2)})
+    aib_repr.repr_losses(model, batch, REPR_ARGS)["total"].backward()
+    assert all(parameter.grad is not None for parameter in model.parameters())
+
+
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:
     psi, history = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4), aib_belief.HistoryEncoder(CONFIG)
     rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.zeros(2, 7)
