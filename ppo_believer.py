@@ -749,7 +749,7 @@ def main(args: Args) -> None:
 class PrivilegedInfoWrapper(gym.Wrapper):
     """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
 
-    Observation: rgb (B, H, W, 3) uint8 of the base camera and joints (B, 25) float32 (qpos, qvel, tool pose).
+    Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
     Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and what else the task hides.
     """
 
@@ -865,8 +865,9 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
 
 
 def make_envs(args: Args) -> gym.vector.VectorEnv:
-    """Build environments whose episodes all last max_episode_steps: actions in [-1, 1], no auto-reset.
+    """Build environments whose episodes all last max_episode_steps, without auto-reset.
 
+    Actions lie in [-1, 1]: changes of the arm's 7 joint angles, and the gripper's opening.
     physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
     forked from one that has imported the tasks, except where there is CUDA, which forbids it.
     """

@@ -14,11 +14,11 @@ TREES = {name: ast.parse(source) for name, source in SOURCES.items()}
 SECTIONS = ["arguments", "networks", "losses", "data", "evaluation", "training", "simulator", "files and stages"]
 OWN = ("Args", "main", "evaluate_checkpoint", "SMALL", "QUICK", "LIMITS", "MAY_DIFFER", "TASKS")
 BUDGET = {  # a reader's: tokens of code, lines
-    "aib_repr": (5791, 657),
+    "aib_repr": (5791, 658),
     "aib_belief": (5883, 646),
-    "ppo_aib": (7290, 827),
-    "ppo_believer": (9274, 1021),
-    "ppo_baseline": (5773, 661),
+    "ppo_aib": (7290, 828),
+    "ppo_believer": (9274, 1022),
+    "ppo_baseline": (5773, 662),
 }
 
 
