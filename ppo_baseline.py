@@ -174,14 +174,15 @@ class NatureCNN(nn.Module):
 class Agent(nn.Module):
     """Actor and critic on image and joints."""
 
-    def __init__(self, image_shape: list[int], joints_dim: int, action_dim: int, init_std: float, amp: bool = False):
+    def __init__(self, envs: gym.vector.VectorEnv, args: Args):
         super().__init__()
-        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, amp))
-        self.joints = orthogonal_init(nn.Sequential(nn.Linear(joints_dim, 128), nn.ReLU()))
+        spaces, (action_dim,) = envs.single_observation_space, envs.single_action_space.shape
+        self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
+        self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
         self.critic = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, 1)))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
-        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(init_std)))
+        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(args.init_std)))
 
     def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
         """Distribution of actions (B, A), value (B,): rgb (B, H, W, 3) uint8 and joints (B, J)."""
@@ -310,8 +311,7 @@ def evaluate_checkpoint(args: Args) -> None:
         setattr(args, name, stored[name])
     check_task(args)
     envs, device = make_envs(args), torch.device(args.device)
-    image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
-    agent = Agent(image_shape, joints_dim, envs.single_action_space.shape[0], args.init_std, args.amp).to(device)
+    agent = Agent(envs, args).to(device)
     agent.load_state_dict(stored["agent"])
     metrics, video = evaluate(envs, agent, args)
     save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
@@ -334,9 +334,8 @@ def main(args: Args) -> None:
     open_run(path, args)
 
     envs, device = make_envs(args), torch.device(args.device)
-    image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
     torch.manual_seed(args.seed)
-    agent = Agent(image_shape, joints_dim, envs.single_action_space.shape[0], args.init_std, args.amp).to(device)
+    agent = Agent(envs, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     if checkpoint:

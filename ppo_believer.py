@@ -313,17 +313,18 @@ class BelieverBelief(nn.Module):
 class Agent(nn.Module):
     """Actor and critic on image, joints and belief (paper 3.3): W(b) = W_agg(mean over particles of W_enc(u_i))."""
 
-    def __init__(self, belief: nn.Module, joints_dim: int, action_dim: int, init_std: float, amp: bool = False):
+    def __init__(self, envs: gym.vector.VectorEnv, belief: nn.Module, args: Args):
         super().__init__()
+        spaces, (action_dim,) = envs.single_observation_space, envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
-        self.cnn = orthogonal_init(NatureCNN(belief.config["image_shape"], 256, amp))
-        self.joints = orthogonal_init(nn.Sequential(nn.Linear(joints_dim, 128), nn.ReLU()))
+        self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
+        self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
         self.w_agg = orthogonal_init(mlp([64, 64, 64]))
         self.actor = orthogonal_init(mlp([256 + 128 + 64, 512, action_dim]))
         self.critic = orthogonal_init(mlp([256 + 128 + 64, 512, 1]))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
-        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(init_std)))
+        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(args.init_std)))
 
     def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
         """Distribution of actions (B, A), value (B,): rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u)."""
@@ -638,9 +639,7 @@ def evaluate_checkpoint(args: Args) -> None:
         setattr(args, name, stored[name])
     check_task(args)
     envs, device = make_envs(args), torch.device(args.device)
-    (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
-    belief = BelieverBelief(stored["config"], args.amp)
-    agent = Agent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
+    agent = Agent(envs, BelieverBelief(stored["config"], args.amp), args).to(device)
     agent.load_state_dict(stored["agent"])
     metrics, video = evaluate(envs, agent, args)
     save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
@@ -671,10 +670,8 @@ def main(args: Args) -> None:
     stored = load(path / "belief.pt", "start again with --overwrite", kind="believer_belief")
 
     envs, device = make_envs(args), torch.device(args.device)
-    (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     torch.manual_seed(args.seed)
-    belief = BelieverBelief(stored["config"], args.amp)
-    agent = Agent(belief, joints_dim, action_dim, args.init_std, args.amp).to(device)
+    agent = Agent(envs, BelieverBelief(stored["config"], args.amp), args).to(device)
     agent.belief.load_state_dict(stored["belief"])
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])

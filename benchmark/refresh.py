@@ -101,9 +101,8 @@ def main(args: Args) -> None:
         fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free")
 
     envs, device = ppo_aib.make_envs(settings), torch.device(settings.device)
-    (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
     belief = beliefs[stored["kind"]](stored["config"], settings.amp)
-    agent = Agent(belief, joints_dim, action_dim, settings.init_std, settings.amp).to(device)
+    agent = Agent(envs, belief, settings).to(device)
     agent.load_state_dict(stored["agent"])
     phi = StateEncoder(len(encoder["phi"]["mean"]), encoder["u_dim"])
     phi.load_state_dict(encoder["phi"])

@@ -169,7 +169,7 @@ def rollout_rate(env_id: str, cores: set[int], episodes: int) -> float:
     torch.set_num_threads(len(cores))
     args = ppo_aib.Args(env_id=env_id, num_workers=2 * len(cores))
     envs = ppo_aib.make_envs(args)
-    agent = ppo_aib.Agent(ppo_aib.AIBBelief(CONFIG), 25, 8, 0.6)
+    agent = ppo_aib.Agent(envs, ppo_aib.AIBBelief(CONFIG), args)
     seeds = np.arange(episodes)
     seconds = [timed(ppo_aib.rollout, envs, agent, args, seeds)[1] for _ in range(2)]
     envs.close()
@@ -210,9 +210,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
     settings = ppo_baseline.Args(env_id=args.env_id, num_minibatches=8)
     seeds, envs = np.arange(args.episodes), ppo_baseline.make_envs(settings)
     clock = Clock(envs)
-    image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
-    (action_dim,) = envs.single_action_space.shape
-    agent = ppo_baseline.Agent(image_shape, joints_dim, action_dim, 0.6)
+    agent = ppo_baseline.Agent(envs, settings)
     times = {name: [] for name in ("our rollout", "mikasa rollout", "our update", "mikasa update")}
     for _ in range(args.repeats):
         data, seconds = timed(ppo_baseline.rollout, envs, agent, settings, seeds)
@@ -230,7 +228,7 @@ def rows(args: Args) -> Iterator[tuple[str, str]]:
 
     shares = {"plain PPO": (ppo_baseline.rollout, agent)}
     for name, amp in (("AIB", False), ("AIB, --amp", True)):
-        believing = ppo_aib.Agent(ppo_aib.AIBBelief(CONFIG, amp), joints_dim, action_dim, 0.6, amp)
+        believing = ppo_aib.Agent(envs, ppo_aib.AIBBelief(CONFIG, amp), ppo_aib.Args(amp=amp))
         shares[name] = (ppo_aib.rollout, believing)
     for name, (play, player) in shares.items():
         measured = []

@@ -67,23 +67,16 @@ class ShowState(gym.Wrapper):
 class StateAgent(nn.Module):
     """Actor and critic on joints and state, or u in its place, in the sizes of ppo_baseline.Agent."""
 
-    def __init__(
-        self,
-        image_shape: list[int],
-        joints_dim: int,
-        action_dim: int,
-        init_std: float,
-        amp: bool,
-        phi: StateEncoder | None = None,
-    ):
+    def __init__(self, envs: gym.vector.VectorEnv, args: ppo_baseline.Args, phi: StateEncoder | None = None):
         super().__init__()
+        (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
         self.phi = phi
         input_dim = 25 + phi(phi.mean).mean.numel() if phi else joints_dim
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(input_dim, 256 + 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
         self.critic = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, 1)))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
-        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(init_std)))
+        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(args.init_std)))
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of joints (B, 25 + D)."""

@@ -6,8 +6,10 @@ os.environ["CUDA_VISIBLE_DEVICES"] = ""  # the tests are for the CPU, where runs
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
@@ -65,6 +67,16 @@ def toy_task(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         toy.take_the_simulators_place(monkeypatch.setattr, module)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def spaces(image_shape: list[int], joints_dim: int, action_dim: int) -> SimpleNamespace:
+    """What an agent wants to know of its environments."""
+    rgb = gym.spaces.Box(0, 255, image_shape, np.uint8)
+    joints = gym.spaces.Box(-np.inf, np.inf, (joints_dim,), np.float32)
+    return SimpleNamespace(
+        single_observation_space={"rgb": rgb, "joints": joints},
+        single_action_space=gym.spaces.Box(-1, 1, (action_dim,), np.float32),
+    )
 
 
 def train(module: ModuleType, **arguments: object) -> Path:

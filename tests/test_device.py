@@ -17,7 +17,7 @@ import ppo_aib
 import ppo_baseline
 import ppo_believer
 import toy
-from conftest import TOY
+from conftest import TOY, spaces
 
 IMAGE, J, A, U, T, B = [36, 36, 3], 3, 2, 4, 10, 3
 CONFIG = {"image_shape": IMAGE, "joints_dim": J, "state_dim": 7, "gru_layers": 1, "u_dim": U, "z_dim": 5}
@@ -81,10 +81,10 @@ def test_stage_2(head: str, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("module", [ppo_aib, ppo_believer, ppo_baseline])
 def test_ppo(module: ModuleType) -> None:
     if module is ppo_baseline:
-        agent, play = module.Agent(IMAGE, J, A, 0.6), module.rollout
+        agent, play = module.Agent(spaces(IMAGE, J, A), module.Args()), module.rollout
     else:
         belief = ppo_aib.AIBBelief(CONFIG) if module is ppo_aib else module.BelieverBelief(CONFIG)
-        agent, play = module.Agent(belief, J, A, 0.6), module.rollout
+        agent, play = module.Agent(spaces(IMAGE, J, A), belief, module.Args()), module.rollout
     args = module.Args(env_id=TOY, device="meta")
     data = play(toy.make_envs(SimpleNamespace(num_workers=2)), agent.to("meta"), args, np.arange(B))
     values = data.pop("values")

@@ -14,7 +14,7 @@ import torch
 import aib_belief
 import aib_repr
 import ppo_baseline
-from conftest import ROOT, TASK
+from conftest import ROOT, TASK, spaces
 
 sys.path.append(str(ROOT / "benchmark"))
 import true_state  # noqa: E402
@@ -80,7 +80,7 @@ def test_the_batch_of_physx_cuda_is_played_and_recorded(
     assert arrays["rewards"][1, 59] == pytest.approx(reward, abs=1e-3) and arrays["cue"][1] == info["cue"]
 
     envs = ppo_baseline.make_envs(ppo_baseline.Args(env_id=TASK, sim_backend="physx_cuda", num_envs=1))
-    agent = ppo_baseline.Agent([128, 128, 3], 25, 8, 0.6)
+    agent = ppo_baseline.Agent(envs, ppo_baseline.Args())
     data = ppo_baseline.rollout(envs, agent, ppo_baseline.Args(env_id=TASK), np.array([5, 6]))
     assert data["rgb"].shape == (60, 2, 128, 128, 3) and data["values"].shape == (61, 2)
     for i, seed in enumerate((5, 6)):
@@ -92,13 +92,14 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
     for obs, *_, info in (shown.reset(seed=3), shown.step(np.zeros(8, np.float32))):
         assert obs in shown.observation_space and obs["rgb"].shape == (1, 1, 3)
         assert np.array_equal(obs["joints"][25:], info["state"]) and info["state"].any()
-    agent = true_state.StateAgent([1, 1, 3], len(obs["joints"]), 8, init_std=0.3, amp=False)
+    shown_spaces = spaces([1, 1, 3], len(obs["joints"]), 8)
+    agent = true_state.StateAgent(shown_spaces, ppo_baseline.Args())
     joints = torch.from_numpy(np.stack([obs["joints"], obs["joints"]]))
     joints[1, -1] += 1
     policy, value = agent({"joints": joints})
     assert policy.mean.shape == (2, 8) and value[0] != value[1], "it sees the state"
     phi = aib_belief.StateEncoder(len(info["state"]), 16)
-    agent = true_state.StateAgent([1, 1, 3], len(obs["joints"]), 8, init_std=0.3, amp=False, phi=phi)
+    agent = true_state.StateAgent(shown_spaces, ppo_baseline.Args(), phi)
     assert agent.joints[0].in_features == 25 + 16
     first = agent({"joints": joints})[1]
     phi.mean[-1] += 1  # now the second state is to phi what the first was

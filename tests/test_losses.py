@@ -15,7 +15,7 @@ import aib_repr
 import ppo_aib
 import ppo_baseline
 import ppo_believer
-from conftest import TOY, train
+from conftest import TOY, spaces, train
 
 IMAGE = [36, 36, 3]
 CONFIG = {"image_shape": IMAGE, "joints_dim": 0, "state_dim": 5, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
@@ -411,7 +411,7 @@ def test_gae_is_the_double_sum() -> None:
 
 def test_belief_aggregator_is_the_papers_formula() -> None:
     torch.manual_seed(0)
-    agent = ppo_aib.Agent(ppo_aib.AIBBelief(CONFIG), 7, A, 0.6)
+    agent = ppo_aib.Agent(spaces(IMAGE, 7, A), ppo_aib.AIBBelief(CONFIG), ppo_aib.Args())
     obs = {"rgb": torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8), "joints": torch.randn(B, 7)}
     particles = torch.randn(B, 30, 4)
     nn.init.orthogonal_(agent.actor[-1].weight, 3.0)  # else too near 0 to tell tanh from nothing
@@ -422,7 +422,7 @@ def test_belief_aggregator_is_the_papers_formula() -> None:
     x = torch.cat([image, joints, belief], -1)
     assert torch.allclose(policy.mean, torch.tanh(agent.actor(x)), atol=1e-6)
     assert torch.allclose(value, agent.critic(x)[:, 0], atol=1e-6)
-    plain = ppo_baseline.Agent(IMAGE, 7, A, 0.6)
+    plain = ppo_baseline.Agent(spaces(IMAGE, 7, A), ppo_baseline.Args())
     nn.init.orthogonal_(plain.actor[-1].weight, 3.0)
     x = torch.cat([plain.cnn(obs["rgb"].float() / 255), plain.joints(obs["joints"])], -1)
     assert torch.allclose(plain(obs)[0].mean, torch.tanh(plain.actor(x)), atol=1e-6)

@@ -39,7 +39,7 @@ def play(toy_stages: Path, **changes: object) -> tuple[ppo_aib.Agent, dict[str, 
     args = ppo_aib.Args(env_id=TOY, **small(ppo_aib, toy_stages, **changes))
     stored = torch.load(args.belief, weights_only=True)
     torch.manual_seed(0)
-    agent = ppo_aib.Agent(ppo_aib.AIBBelief(stored["config"], args.amp), 3, 2, 0.6, args.amp)
+    agent = ppo_aib.Agent(toy.ToyMemory(1), ppo_aib.AIBBelief(stored["config"], args.amp), args)
     agent.belief.load_state_dict(stored["belief"])
     torch.manual_seed(1)
     return agent, ppo_aib.rollout(toy.make_envs(args), agent, args, np.arange(8))
@@ -117,7 +117,7 @@ def test_u_r2_tells_what_the_belief_knows_of_the_episodes_just_played(
         return {**data, "particles": (u + error)[:, :, None].expand(-1, -1, 30, -1)}
 
     monkeypatch.setattr(module, "rollout", informed)
-    agent = module.Agent(belief, 3, 2, 0.6)
+    agent = module.Agent(toy.ToyMemory(1), belief, args)
     for size, expected in ((0.0, 1.0), (0.5**0.5, 0.5)):  # noqa: B007  (informed reads it)
         metrics, _ = module.evaluate(toy.make_envs(args), agent, args)
         assert metrics["u_r2"] == pytest.approx(expected, abs=0.1)
@@ -158,11 +158,11 @@ def test_the_three_methods_explore_with_the_same_noise(toy_stages: Path) -> None
         module, policy = SCRIPTS[script], []
         args = module.Args(env_id=TOY, noise_beta=0.7, **small(module, toy_stages))
         if script == "ppo_baseline":
-            agent = module.Agent([36, 36, 3], 3, 2, 0.6)
+            agent = module.Agent(toy.ToyMemory(1), args)
         else:
             stored = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)
             belief = ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief
-            agent = module.Agent(belief(stored["config"]), 3, 2, 0.6)
+            agent = module.Agent(toy.ToyMemory(1), belief(stored["config"]), args)
         agent.register_forward_hook(lambda _, inputs, output, seen=policy: seen.append(output[0]))
         for seeds in (np.arange(3), np.arange(3, 6)):  # one round each
             data = module.rollout(toy.make_envs(args), agent, args, seeds)
@@ -254,7 +254,7 @@ def test_the_belief_is_frozen_and_the_aggregator_learns(toy_task: Path, toy_stag
     assert all(torch.equal(trained["agent"][f"belief.{name}"], value) for name, value in before.items())
     torch.manual_seed(1)
     belief = (ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief)(trained["config"])
-    start = module.Agent(belief, 3, 2, module.Args.init_std).state_dict()
+    start = module.Agent(toy.ToyMemory(1), belief, module.Args()).state_dict()
     for part in ("w_enc.0.weight", "w_agg.2.weight", "cnn.conv.0.weight", "actor.2.weight", "log_std"):
         assert not torch.equal(trained["agent"][part], start[part]), part
 
@@ -291,7 +291,7 @@ def test_evaluate_takes_over_what_the_episodes_depend_on(toy_task: Path, monkeyp
 
 
 def test_orthogonal_initialisation() -> None:
-    agent = ppo_baseline.Agent([36, 36, 3], 3, 2, ppo_baseline.Args.init_std)
+    agent = ppo_baseline.Agent(toy.ToyMemory(1), ppo_baseline.Args())
     for layer, gain in ((agent.joints[0], 2**0.5), (agent.actor[2], 0.01 * 2**0.5), (agent.critic[2], 2**0.5)):
         gram = layer.weight @ layer.weight.T if layer.weight.shape[0] <= layer.weight.shape[1] else None
         gram = layer.weight.T @ layer.weight if gram is None else gram
