@@ -314,15 +314,28 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-def read_transitions(dataset: Path, index: np.ndarray, images: bool, device: torch.device) -> dict[str, Tensor]:
-    """Transitions (s, o, a, r, s', o') number index (B,), counted through all episodes (line 3), each (B, ...)."""
-    # opened anew each time, so that pages once read do not stay in this process
-    arrays = {file.stem: np.load(file, mmap_mode="r") for file in dataset.glob("*.npy")}
-    episode, t = np.divmod(index, arrays["actions"].shape[1])
-    observed = ("rgb", "joints", "state") if images else ("joints", "state")
-    batch = {name: arrays[name][episode, t] for name in (*observed, "actions", "rewards")}
-    batch |= {f"next_{name}": arrays[name][episode, t + 1] for name in observed}
-    return {name: torch.from_numpy(x).to(device) for name, x in batch.items()}
+class TransitionDataset:
+    """Transitions of dataset/, with or without images; images on the GPU where they fit in half of its free memory."""
+
+    def __init__(self, dataset: Path, images: bool, device: torch.device):
+        names = ("joints", "state", "actions", "rewards")
+        self.arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")).to(device) for name in names}
+        self.file, self.images, self.device, self.rgb = dataset / "rgb.npy", images, device, None
+        rgb = np.load(self.file, mmap_mode="c")  # copy-on-write, without which torch warns
+        if images and device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
+            self.rgb = torch.from_numpy(rgb).to(device)
+
+    def __call__(self, index: np.ndarray) -> dict[str, Tensor]:
+        """Transitions (s, o, a, r, s', o') number index (B,), counted through all episodes (line 3), each (B, ...)."""
+        episode, t = np.divmod(index, self.arrays["actions"].shape[1])
+        batch = {name: x[episode, t] for name, x in self.arrays.items()}
+        batch |= {f"next_{name}": self.arrays[name][episode, t + 1] for name in ("joints", "state")}
+        if self.images:
+            # opened anew each time, so that pages once read do not stay in this process
+            rgb = np.load(self.file, mmap_mode="r") if self.rgb is None else self.rgb
+            batch["rgb"] = torch.as_tensor(rgb[episode, t], device=self.device)
+            batch["next_rgb"] = torch.as_tensor(rgb[episode, t + 1], device=self.device)
+        return batch
 
 
 # ---------------------------------------------------------------- training
@@ -339,8 +352,8 @@ def main(args: Args) -> None:
         print(f"{path / 'repr.pt'} is finished; --overwrite recreates it")
         return
     open_run(path, args)
-    dataset = path / "dataset"
-    arrays = collect_random_episodes(args, dataset)
+    arrays = collect_random_episodes(args, path / "dataset")
+    transitions = TransitionDataset(path / "dataset", args.psi_images, device)
     train = {name: x[:-num_val] for name, x in arrays.items()}
     steps, action_dim = arrays["actions"].shape[1:]
 
@@ -362,8 +375,8 @@ def main(args: Args) -> None:
         g.reward_std.fill_(train["rewards"].std(dtype=np.float64) + 1e-8)
     model = nn.ModuleDict({"phi": phi, "psi": psi, "g": g}).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
-    transitions, held_out = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
-    per_epoch, first = math.ceil(len(transitions) / args.batch_size), 0
+    train_inds, val_inds = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
+    per_epoch, first = math.ceil(len(train_inds) / args.batch_size), 0
     if (path / "checkpoint.pt").exists():
         checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint")
         model.load_state_dict(checkpoint["model"])
@@ -375,9 +388,9 @@ def main(args: Args) -> None:
 
     for epoch in range(first, args.epochs):
         torch.manual_seed(args.seed * 1_000_000 + epoch)  # so that a resumed run repeats the epoch
-        order = np.random.default_rng([args.seed, epoch]).permutation(transitions)
+        order = np.random.default_rng([args.seed, epoch]).permutation(train_inds)
         for index in np.array_split(order, per_epoch):
-            losses = repr_losses(model, read_transitions(dataset, index, args.psi_images, device), args)
+            losses = repr_losses(model, transitions(index), args)
             optimizer.zero_grad()
             losses["total"].backward()
             nn.utils.clip_grad_norm_(model.parameters(), math.inf, error_if_nonfinite=True)  # only stops at NaN
@@ -385,8 +398,7 @@ def main(args: Args) -> None:
             bar.update()
 
         with torch.no_grad():
-            val_inds = held_out[:: len(held_out) // 1000 + 1]
-            val_batch = read_transitions(dataset, val_inds, args.psi_images, device)
+            val_batch = transitions(val_inds[:: len(val_inds) // 1000 + 1])
             val_losses = repr_losses(model, val_batch, args)
             active = (phi(val_batch["state"]).mean.std(0) > 0.1).sum()
         update = (epoch + 1) * per_epoch

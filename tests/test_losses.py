@@ -104,14 +104,15 @@ def test_transitions_lie_within_an_episode_and_each_is_learnt_from_once_an_epoch
 ) -> None:
     dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
     arrays = {file.stem: np.load(file) for file in dataset.glob("*.npy")}
-    batch = aib_repr.read_transitions(dataset, np.array([0, 9, 10, 199]), True, torch.device("cpu"))
+    batch = aib_repr.TransitionDataset(dataset, True, torch.device("cpu"))(np.array([0, 9, 10, 199]))
     for row, (episode, t) in enumerate([(0, 0), (0, 9), (1, 0), (19, 9)]):
         for name in ("rgb", "joints", "state", "actions", "rewards"):
             assert np.array_equal(batch[name][row], arrays[name][episode, t]), name
         for name in ("rgb", "joints", "state"):
             assert np.array_equal(batch[f"next_{name}"][row], arrays[name][episode, t + 1]), name
-    read, transitions = [], aib_repr.read_transitions
-    monkeypatch.setattr(aib_repr, "read_transitions", lambda *args: read.append(args[1]) or transitions(*args))
+    read, transitions = [], aib_repr.TransitionDataset.__call__
+    patched = lambda self, index: read.append(index) or transitions(self, index)  # noqa: E731
+    monkeypatch.setattr(aib_repr.TransitionDataset, "__call__", patched)
     train(aib_repr, num_episodes=20, val_fraction=0.25, epochs=2, batch_size=50)
     epochs, held_out = [np.concatenate(read[:3]), np.concatenate(read[4:7])], [read[3], read[7]]
     assert all(sorted(epoch) == list(range(150)) for epoch in epochs), "of 15 episodes of 10 steps"
@@ -320,7 +321,7 @@ def test_psi_without_images_sees_the_joints_alone(toy_stages: Path) -> None:
     q, other = psi(None, torch.zeros(2, 7)), psi(None, torch.ones(2, 7))
     assert q.mean.shape == (2, 4) and not torch.allclose(q.mean, other.mean)
     dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
-    batch = aib_repr.read_transitions(dataset, np.array([3, 4]), False, torch.device("cpu"))
+    batch = aib_repr.TransitionDataset(dataset, False, torch.device("cpu"))(np.array([3, 4]))
     assert set(batch) == {"joints", "state", "actions", "rewards", "next_joints", "next_state"}
     psi = aib_repr.ObservationEncoder(tuple(IMAGE), 3, 4, images=False)
     model = nn.ModuleDict({"phi": aib_repr.StateEncoder(4, 4), "psi": psi, "g": aib_repr.Predictor(4, 2)})
