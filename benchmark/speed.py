@@ -1,7 +1,7 @@
 """How fast, as ratios measured in one run: `make bench`.
 
 A simulator's start, step and pictures against MIKASA-Robo's stock environment; steps/s of a rollout of ppo_aib.py by
-cores; stage 2's update against a per-step loop; rollout and update of ppo_baseline.py against the agent and the buffers
+cores and side by side; stage 2's update against a per-step loop; rollout and update of ppo_baseline.py against the agent and the buffers
 of MIKASA-Robo's own PPO script on the same simulator and sizes; what of a rollout is simulator.
 
 Usage:   python benchmark/speed.py
@@ -17,7 +17,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -178,7 +178,7 @@ def rollout_rate(env_id: str, cores: set[int], episodes: int) -> float:
 
 def afresh(function: Callable, *arguments: object) -> object:
     """What a function returns in a process of its own, with one thread for each library as in the scripts' workers."""
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE")
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
 
@@ -200,6 +200,10 @@ def simulator_rows(args: Args) -> Iterator[tuple[str, str]]:
     cores = sorted(os.sched_getaffinity(0))
     one, every = (afresh(rollout_rate, args.env_id, set(use), args.episodes) for use in (cores[:1], cores))
     yield f"rollout of AIB, {args.env_id}", f"{one:.0f} steps/s on 1 core, {every:.0f} on {len(cores)}"
+    with ThreadPoolExecutor(2) as pool:
+        runs = [pool.submit(afresh, rollout_rate, args.env_id, set(cores), args.episodes) for _ in range(2)]
+        together = sum(run.result() for run in runs)
+    yield "two rollouts side by side", f"{together / every:.2f} of the steps/s of one alone, on {len(cores)} cores"
 
 
 def rows(args: Args) -> Iterator[tuple[str, str]]:
