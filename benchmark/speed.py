@@ -1,8 +1,9 @@
 """How fast, as ratios measured in one run: `make bench`.
 
 A simulator's start, step and pictures against MIKASA-Robo's stock environment; steps/s of a rollout of ppo_aib.py by
-cores and side by side; stage 2's update against a per-step loop; rollout and update of ppo_baseline.py against the agent and the buffers
-of MIKASA-Robo's own PPO script on the same simulator and sizes; what of a rollout is simulator.
+cores, and of two side by side; stage 2's update against a per-step loop; rollout and update of ppo_baseline.py against
+the agent and the buffers of MIKASA-Robo's own PPO script on the same simulator and sizes; what of a rollout is
+simulator.
 
 Usage:   python benchmark/speed.py
          python benchmark/speed.py --env-id InterceptFast-v0 --episodes 16
