@@ -2,13 +2,14 @@
 # make demo: set everything up, then train AIB on RememberColor3 with --small, for hours, and draw its curve
 # make test: set everything up, then lint and run the tests
 # make test-all: all tests, with every kill of every stage and three seeds of the learning test
+# make test-gpu: the three PPO scripts' --quick on a GPU, with physics there and then on the CPU
 # make bench: speed and memory, as ratios measured in one run
 # make bench-belief: train the belief, one without action head and Believer's on RememberColor3; what each remembers
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .ONESHELL:
 .SILENT:
-.PHONY: run demo test test-all bench bench-belief setup vulkan
+.PHONY: run demo test test-all test-gpu bench bench-belief setup vulkan
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -30,6 +31,16 @@ test: setup
 
 test-all: setup
 	$(PY) -m pytest --numprocesses auto --dist loadfile
+
+test-gpu: setup
+	$(PY) -c "import sys, torch; sys.exit(not torch.cuda.is_available())" || { echo "error: torch sees no CUDA device here" >&2; exit 2; }
+	root=$$PWD
+	for backend in physx_cuda physx_cpu; do
+	    cd "$$(mktemp -d)"
+	    for script in ppo_aib ppo_believer ppo_baseline; do
+	        $$root/$(PY) $$root/$$script.py --env-id InterceptFast-v0 --quick --sim-backend $$backend
+	    done
+	done
 
 bench: setup
 	$(PY) -m pip install --quiet --no-deps colorama  # MIKASA-Robo's own PPO script wants it
