@@ -177,9 +177,9 @@ TASKS = {  # Table 5, where it differs from the defaults above, which are Interc
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
-SMALL = dict(exp_name="ppo_believer_small", total_timesteps=240_000, num_envs=16, num_minibatches=8, update_epochs=8)
-SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
-SMALL |= dict(num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
+SMALL = dict(exp_name="ppo_believer_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
+SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, eval_every=15, num_eval_episodes=64)
+SMALL |= dict(amp=BFLOAT16, num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
 QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_eval_episodes=2)
 QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_episodes=8, num_updates=4, batch_episodes=4)
