@@ -42,7 +42,8 @@ CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations t
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
-ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX; with the next line, glibc keeps freed memory for the next update
+# glibc keeps freed memory for the next update instead of returning it, which makes large tensors cheaper on a CPU
+ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
 ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
@@ -68,7 +69,7 @@ class Args:
     robot_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results differ by rounding only"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -95,7 +96,7 @@ class Args:
     action_lambda: float = 1.0
     """weight of the action head's loss"""
     fm_latent: Literal["mean", "sample"] = "mean"
-    """what the action head sees of the posterior; from samples, the paper's text, it learns nothing at the start"""
+    """what the action head sees of the posterior; samples, as the paper says, are mostly noise at the start"""
     bptt_steps: int | None = None
     """cut back-propagation through time after so many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
@@ -196,7 +197,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has the actions too; here the joints, which follow them, must do.
+    The paper's history (E.2) has the actions too; here only the joints, which the actions move.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -258,16 +259,16 @@ class AIBBelief(nn.Module):
 def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int | None = None) -> Tensor:
     """h (T, B, 256) of whole episodes: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
 
-    All T * B frames go through the CNN at once, or, where they are too many for their activations to be kept, in chunks
-    that the backward pass computes once more. bptt_steps cuts back-propagation through time into pieces.
+    All T * B frames go through the CNN at once, or, where their activations would not fit, in chunks with gradient
+    checkpointing. bptt_steps truncates back-propagation through time.
     """
     frames = [batch[name].flatten(0, 1).split(CNN_CHUNK) for name in ("rgb", "joints")]
     chunks = list(zip(*frames, strict=True))
     if len(chunks) == 1:
         x = history.embed(*chunks[0])
     else:
-        recompute = torch.utils.checkpoint.checkpoint
-        x = torch.cat([recompute(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
+        checkpoint = torch.utils.checkpoint.checkpoint
+        x = torch.cat([checkpoint(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
     outputs, hidden = [], None
     for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
         h, hidden = history(piece, hidden)
@@ -297,7 +298,10 @@ def flow_matching_loss(
 
 
 def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
-    """L_Total = -L_VAE + lambda L_FM and its terms, averaged over all steps of a batch of whole episodes."""
+    """L_Total = -L_VAE (KL weighted by beta) + lambda L_FM, and its terms, means over all steps of whole episodes.
+
+    With args.action_head mse, the squared error of the actions stands in L_FM's place.
+    """
     h = encode_history(model["belief"].history, batch, args.bptt_steps)
     nll, kl, z, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
     losses = {"nll": nll.mean(), "kl": kl.mean()}
@@ -339,7 +343,7 @@ class EpisodeDataset:
 
 
 def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
-    """Roll each episode's images rgb (T, B, H, W, 3) in place by up to so many pixels (DrQ shifts image by image)."""
+    """Shift each episode's images rgb (T+1, B, H, W, 3) in place by up to so many pixels, wrapping at the edges."""
     shifts = rng.integers(-pixels, pixels, (rgb.shape[1], 2), endpoint=True)
     for images, shift in zip(rgb.unbind(1), shifts.tolist(), strict=True):
         images.copy_(images.roll(shift, (1, 2)))
@@ -369,7 +373,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
 
 
 def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
-    """Linear read-out of y (N, K) from x (N, F): R2, or accuracy of few whole numbers, on x_test and y_test.
+    """Linear probe of y (N, K) from x (N, F): R2, or accuracy of few integers, on x_test and y_test.
 
     The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
     """
@@ -392,7 +396,7 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
     nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows of
     three possible places is right about each; nll_posterior (E, T+1): -log p(u|z,h) under z
     """
-    torch.manual_seed(0)  # the same noise at every look, so that looks compare
+    torch.manual_seed(0)  # the same noise at every validation
     parts = []
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
@@ -496,7 +500,7 @@ def main(args: Args) -> None:
         losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # one odd batch can cost the memory
+        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # an outlier can undo the memory
         optimizer.step()
         if update % 10 == 0:
             for name, value in losses.items():
@@ -513,7 +517,7 @@ def main(args: Args) -> None:
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
 
-    # the last weights: held-out error and likelihood are best before the belief remembers
+    # the last weights are kept: held-out error and likelihood are best early, when the belief does not yet remember
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = probe_belief(fit, test)
     if args.action_head == "flow":
@@ -586,7 +590,9 @@ def open_run(path: Path, args: Args) -> None:
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     if args.overwrite:
-        for file in path.iterdir():
+        for file in sorted(
+            path.iterdir(), key=lambda file: file.name == "args.json"
+        ):  # that last, should this be killed
             shutil.rmtree(file) if file.is_dir() else file.unlink()
     save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 

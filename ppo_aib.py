@@ -56,7 +56,8 @@ CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
-ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX; with the next line, glibc keeps freed memory for the next update
+# glibc keeps freed memory for the next update instead of returning it, which makes large tensors cheaper on a CPU
+ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
 ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
@@ -82,7 +83,7 @@ class Args:
     robot_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu (results: equal but for rounding), each with memory on a GPU"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results differ by rounding only"""
     small: bool = False
     """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
     quick: bool = False
@@ -225,7 +226,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has the actions too; here the joints, which follow them, must do.
+    The paper's history (E.2) has the actions too; here only the joints, which the actions move.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -336,7 +337,7 @@ def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator)
     """Gaussian noise of shape (..., T), N(0, 1) at every step, spectrum 1/f**beta over time (Eberhard et al., 2023)."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
-    return noise * np.sqrt(power[1:].sum() / power.sum())  # the package's std is 1 without the constant term
+    return noise * np.sqrt(power[1:].sum() / power.sum())  # the package leaves f = 0 out when it scales the std to 1
 
 
 @torch.no_grad()
@@ -564,7 +565,9 @@ class PrivilegedInfoWrapper(gym.Wrapper):
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        if not self.task.gpu_sim_enabled:  # on a CPU alone, an object that evaluate hides (z = 1000) would stay there
+        # evaluate hides objects by moving them to z = 1000; the picture is taken, and _view moves them back. On the GPU
+        # simulator the next physics step does that by itself.
+        if not self.task.gpu_sim_enabled:
             self.task.evaluate = evaluate
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
@@ -761,7 +764,9 @@ def open_run(path: Path, args: Args) -> None:
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     if args.overwrite:
-        for file in path.iterdir():
+        for file in sorted(
+            path.iterdir(), key=lambda file: file.name == "args.json"
+        ):  # that last, should this be killed
             shutil.rmtree(file) if file.is_dir() else file.unlink()
     save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 
