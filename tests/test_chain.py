@@ -142,8 +142,12 @@ def test_refresh_adds_episodes_of_the_agent(quick_runs: Path) -> None:
     assert code == 0, err
 
 
-def test_refresh_takes_believers_agent_and_no_other(quick_runs: Path) -> None:
+@pytest.mark.thorough
+def test_refresh_takes_believers_agent(quick_runs: Path) -> None:
     assert refresh(quick_runs, "ppo_believer")[0] == 0
+
+
+def test_refresh_takes_no_agent_without_belief(quick_runs: Path) -> None:
     code, _, err = refresh(quick_runs, "ppo_baseline")
     assert code == 2 and "is a file of another kind (ppo_baseline agent)" in err
 
