@@ -307,7 +307,7 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
                 dtype, shape = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32), (count, *x.shape[1:])
                 arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, shape)
         for name, x in buffer.items():
-            arrays[name][rows] = x.cpu()
+            arrays[name][rows[: count - first]] = x[: count - first].cpu()
         meta["episodes_done"] = min(first + envs.num_envs, count)
         save(path / "meta.json", json.dumps(meta, indent=2).encode())
     bar.close()

@@ -481,7 +481,8 @@ def rollout(
     rounds = range(0, num_episodes, envs.num_envs)
     bar = tqdm(total=len(rounds) * steps, desc="rollout", unit="step", unit_scale=envs.num_envs, leave=False)
     for first in rounds:
-        rows = np.arange(first, first + envs.num_envs) % num_episodes  # the last round is filled up with repetitions
+        rows = np.arange(first, first + envs.num_envs) % num_episodes  # the last round is filled up with repetitions,
+        new = rows[: num_episodes - first]  # which are not kept
         obs, info = envs.reset(seed=seeds[rows].tolist())
         hidden = None
         for t in range(steps + 1):
@@ -490,7 +491,8 @@ def rollout(
             h, hidden = agent.belief.history(x[None], hidden)
             u = agent.belief.decode(h[0], z_noise[t, rows])
             step["particles"] = u.mean + u.stddev * u_noise[t, rows]
-            dist, buffer["values"][t, rows] = agent(step)
+            dist, values = agent(step)
+            buffer["values"][t, new] = values[: len(new)]
             if t == steps:
                 break  # the last observation is only for its value
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
@@ -503,7 +505,7 @@ def rollout(
             for name, x in step.items():
                 if name not in buffer:
                     buffer[name] = torch.empty(steps, num_episodes, *x.shape[1:], dtype=x.dtype, device=device)
-                buffer[name][t, rows] = x
+                buffer[name][t, new] = x[: len(new)]
             bar.update()
     bar.close()
     return buffer
