@@ -634,9 +634,8 @@ def open_run(path: Path, args: Args) -> None:
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     if args.overwrite:
-        for file in sorted(
-            path.iterdir(), key=lambda file: file.name == "args.json"
-        ):  # that last, should this be killed
+        # args.json goes last: a kill in between must not let other arguments resume what is left
+        for file in sorted(path.iterdir(), key=lambda file: file.name == "args.json"):
             shutil.rmtree(file) if file.is_dir() else file.unlink()
     save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 

@@ -479,7 +479,8 @@ def rollout(
         u_noise.zero_()
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     rounds = range(0, num_episodes, envs.num_envs)
-    bar = tqdm(total=len(rounds) * steps, desc="rollout", unit="step", unit_scale=envs.num_envs, leave=False)
+    name = "evaluation" if deterministic else "rollout"
+    bar = tqdm(total=len(rounds) * steps, desc=name, unit="step", unit_scale=envs.num_envs, leave=False)
     for first in rounds:
         rows = np.arange(first, first + envs.num_envs) % num_episodes  # the last round is filled up with repetitions,
         new = rows[: num_episodes - first]  # which are not kept
@@ -656,6 +657,8 @@ def main(args: Args) -> None:
     check_task(args)
     per_iteration = gym.spec(args.env_id).max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // per_iteration)
+    if args.num_minibatches > per_iteration:
+        fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
     checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
@@ -712,7 +715,7 @@ def main(args: Args) -> None:
             if losses["approx_kl"] > args.target_kl:
                 break
         for name in losses:
-            scalars[f"losses/{name}"] = torch.stack([minibatch[name] for minibatch in stepped]).mean().item()
+            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in stepped or [losses]]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(stepped)}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
@@ -960,9 +963,8 @@ def open_run(path: Path, args: Args) -> None:
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     if args.overwrite:
-        for file in sorted(
-            path.iterdir(), key=lambda file: file.name == "args.json"
-        ):  # that last, should this be killed
+        # args.json goes last: a kill in between must not let other arguments resume what is left
+        for file in sorted(path.iterdir(), key=lambda file: file.name == "args.json"):
             shutil.rmtree(file) if file.is_dir() else file.unlink()
     save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 

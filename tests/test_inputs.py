@@ -129,6 +129,13 @@ def test_numbers_and_devices(
     refused((stop.value.code, *capsys.readouterr()), *words)
 
 
+def test_more_minibatches_than_steps(toy_task: Path, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as stop:
+        train(ppo_baseline, num_envs=2, num_minibatches=21)
+    refused((stop.value.code, *capsys.readouterr()), "--num-minibatches 21", "at most the 20 steps")
+    assert not list(toy_task.iterdir())
+
+
 # ---------------------------------------------------------------- files, on the toy task's stages
 
 REPR, BELIEF = Path(f"runs/{TOY}__aib_repr__1"), Path(f"runs/{TOY}__aib_belief__1")

@@ -243,6 +243,41 @@ def test_the_update_ends_at_the_kl_target(
         assert event.value <= target_kl
 
 
+def test_an_iteration_may_end_without_an_update(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rounding between rollout and update can exceed a small KL target at the first minibatch."""
+    losses = ppo_baseline.ppo_losses
+    monkeypatch.setattr(ppo_baseline, "ppo_losses", lambda *args: {**losses(*args), "approx_kl": torch.tensor(1.0)})
+    events = EventAccumulator(str(train(ppo_baseline, **small(ppo_baseline, toy_stages)))).Reload()
+    assert {event.value for event in events.Scalars("charts/updates")} == {0}
+    assert {event.value for event in events.Scalars("losses/approx_kl")} == {1}
+
+
+class CountingEnvs(toy.ToyMemory):
+    """Joints tell how many rounds were begun and which environment of the batch plays."""
+
+    rounds = 0
+
+    def reset(self, **kwargs: object) -> tuple[dict, dict]:
+        self.rounds += 1
+        return super().reset(**kwargs)
+
+    def _observe(self) -> tuple[dict, dict]:
+        obs, info = super()._observe()
+        obs["joints"][:, 0], obs["joints"][:, 1] = self.rounds, np.arange(self.num_envs)
+        return obs, info
+
+
+@pytest.mark.parametrize("num_envs, rounds", [(3, [1, 1, 1, 2]), (8, [1, 1, 1, 1])])
+def test_repetitions_that_fill_the_last_round_are_not_kept(num_envs: int, rounds: list[int]) -> None:
+    """On physx_cuda they are other episodes, because a batch is seeded by its first seed."""
+    envs, args = CountingEnvs(num_envs), ppo_baseline.Args(env_id=TOY)
+    data = ppo_baseline.rollout(envs, ppo_baseline.Agent(envs, args), args, np.arange(4))
+    assert (data["joints"][:, :, 0] == torch.tensor(rounds)).all()
+    assert (data["joints"][:, :, 1] == torch.arange(4) % num_envs).all()
+
+
 @pytest.mark.parametrize("script", ["ppo_aib", "ppo_believer"])
 def test_the_belief_is_frozen_and_the_aggregator_learns(toy_task: Path, toy_stages: Path, script: str) -> None:
     module = SCRIPTS[script]
