@@ -26,9 +26,9 @@ demo: setup
 	$(PY) aib_belief.py --env-id RememberColor3-v0 --small
 	echo "stage 3 of 3: PPO on observation and belief, about 60 minutes; curves: .venv/bin/tensorboard --logdir runs"
 	$(PY) ppo_aib.py --env-id RememberColor3-v0 --small
-	$(PY) benchmark/report.py --small
+	$(PY) benchmark/report.py --runs runs
 	echo "chance level of success_once: 0.33"
-	echo "curve: benchmark/report/small.png; videos: $$(ls -d runs/RememberColor3-v0__ppo_aib_small__1/videos)"
+	echo "curve: benchmark/report/learning_curves.png; videos: $$(ls -d runs/RememberColor3-v0__ppo_aib_small__1/videos)"
 
 test: setup
 	$(PY) -m ruff check .

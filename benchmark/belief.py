@@ -131,7 +131,7 @@ def main(args: Args) -> None:
             script = ["-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}){BELIEVER}"]
             script = script if row == "believer" else [str(ROOT / "aib_belief.py")]
             run([*script, *base, *stage_2, "--exp-name", name, *ROWS[row]])
-    print(report.belief_table(args.env_id, report.read_beliefs(Path("runs"))[args.env_id]))
+    print(report.own_beliefs(report.belief_rows(Path("runs"), ""), args.env_id))
     device = "cuda" if torch.cuda.is_available() else "cpu"
     if args.speed:
         print(speed(torch.device(device)))

@@ -1,370 +1,414 @@
-"""Tables 1, 6, 7, 8 and Figures 2, 3, 4, 8 of the paper from finished runs, beside the paper's own numbers.
+"""The tables and figures of README.md and docs/results.md from benchmark/results/*.csv, or a report on runs/.
 
-With --small, the --small runs on whatever tasks there are: a table and a figure of the three methods, and a table and a
-figure of what their beliefs remember.
-
-Usage:   python benchmark/report.py                 (reads runs/, writes benchmark/report/)
-         python benchmark/report.py --small --runs benchmark/results --output benchmark/results   (the README's figure)
-Reads:   {runs}/{env_id}__{exp_name}__{seed}/: args.json; eval.csv of the PPO scripts, diagnostics.json of the beliefs
-Writes:  {output}/report.md (small.md) and PNG figures
+Usage:   python benchmark/report.py                                  (README.md, docs/results.md and their figures)
+         python benchmark/report.py --runs runs                      (learning curves and last values of your runs)
+         python benchmark/report.py --runs runs --add "coloured noise"   (append your runs to eval.csv, beliefs.csv)
+Reads:   benchmark/results/: eval.csv, beliefs.csv, paper.csv; or runs/*/: args.json with eval.csv, diagnostics.json
+Writes:  tables between <!-- name --> and <!-- end --> in the pages, PNG figures; or benchmark/report/
 """
 
 import csv
 import json
+import re
 import sys
-import textwrap
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
 import numpy as np
+import scipy.stats
 import tyro
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
-TASKS = {
-    "RememberShapeAndColor3x2-v0": "RSC3x2",
-    "RememberColor9-v0": "RC9",
-    "InterceptMedium-v0": "IMed",
-    "InterceptFast-v0": "IFast",
-}
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmark" / "results"
+KEY = ["task", "method", "setting", "seed", "step"]
+METRICS = ["success_once", "success_at_end", "return", "u_r2", "u_r2_at_end"]
 METHODS = {"ppo_aib": "AIB", "ppo_believer": "Believer", "ppo_baseline": "PPO"}
-COLOURS = {"ppo_aib": "tab:red", "ppo_believer": "tab:blue", "ppo_baseline": "tab:green"}
-HEADS = {"ppo_aib": "flow matching", "ppo_aib_none": "no action head", "ppo_aib_mse": "MSE regression"}
-BELIEFS = {  # action_head in args.json, which Believer has not
-    "flow": "AIB, flow matching",
-    "mse": "AIB, MSE regression",
-    "none": "AIB, no action head",
-    None: "Believer",
+HEADS = {"flow": "AIB", "mse": "AIB, MSE head", "none": "AIB, no head", None: "Believer"}  # action_head in args.json
+COLOURS = {"AIB": "tab:red", "Believer": "tab:blue", "PPO": "tab:green"}
+COLOURS |= {"AIB, MSE head": "tab:orange", "AIB, no head": "tab:purple"}
+CHANCE = {  # one of so many objects is the right one
+    "RememberColor3-v0": 1 / 3,
+    "RememberColor5-v0": 1 / 5,
+    "RememberColor9-v0": 1 / 9,
+    "RememberShapeAndColor3x2-v0": 1 / 6,
 }
-BELIEF_DEFAULTS = {
-    "fm_latent": "mean",
-    "history_joints": True,
-    "action_lambda": 1.0,
-    "image_norm": "mean",
-    "beta": 1.0,
-    "image_shift": 0,
-}
-BELIEF_COLUMNS = {  # of diagnostics.json
-    "cue from h": "cue_from_h",
-    "cue from the mean particle": "cue_from_particle",
-    "R² of u, mean particle": "u_r2_prior",
-    "−log p(u), prior": "nll_prior",
-    "posterior": "nll_posterior",
-    "R² of a_t": "action_readout",
-    "L_FM": "flow_loss",
-    "flow gain": "flow_gain",
-}
-LAMBDAS = {"ppo_aib": "λ = 1", "ppo_aib_lambda_0.1": "λ = 0.1", "ppo_aib_lambda_0.01": "λ = 0.01"}
-PAPER = {  # (column of eval.csv, statistic): {task: (AIB, Believer, PPO)}
-    ("success_once", "last"): {
-        "RSC3x2": ("0.82 ± 0.04", "0.76 ± 0.02", "0.04 ± 0.02"),
-        "RC9": ("0.36 ± 0.07", "0.35 ± 0.03", "0.17 ± 0.03"),
-        "IMed": ("0.54 ± 0.06", "0.56 ± 0.10", "0.70 ± 0.14"),
-        "IFast": ("0.67 ± 0.07", "0.52 ± 0.14", "0.01 ± 0.01"),
-    },
-    ("success_at_end", "last"): {
-        "RSC3x2": ("0.81 ± 0.03", "0.74 ± 0.04", "0.01 ± 0.01"),
-        "RC9": ("0.25 ± 0.06", "0.21 ± 0.01", "0.10 ± 0.01"),
-        "IMed": ("0.17 ± 0.04", "0.11 ± 0.03", "0.02 ± 0.02"),
-        "IFast": ("0.09 ± 0.03", "0.08 ± 0.02", "0.00 ± 0.00"),
-    },
-    ("success_once", "max"): {
-        "RSC3x2": ("0.87 ± 0.01", "0.82 ± 0.01", "0.14 ± 0.03"),
-        "RC9": ("0.41 ± 0.08", "0.38 ± 0.03", "0.20 ± 0.02"),
-        "IMed": ("0.68 ± 0.01", "0.65 ± 0.07", "0.71 ± 0.13"),
-        "IFast": ("0.77 ± 0.06", "0.69 ± 0.12", "0.02 ± 0.02"),
-    },
-    ("success_at_end", "max"): {
-        "RSC3x2": ("0.86 ± 0.01", "0.80 ± 0.02", "0.04 ± 0.01"),
-        "RC9": ("0.28 ± 0.05", "0.23 ± 0.02", "0.15 ± 0.02"),
-        "IMed": ("0.23 ± 0.02", "0.18 ± 0.03", "0.03 ± 0.01"),
-        "IFast": ("0.14 ± 0.01", "0.12 ± 0.02", "0.00 ± 0.00"),
-    },
-}
-TITLES = {
-    ("success_once", "last"): "Table 1: success_once, mean of the last three evaluations",
-    ("success_at_end", "last"): "Table 6: success_at_end, mean of the last three evaluations",
-    ("success_once", "max"): "Table 7: success_once, maximum over evaluations",
-    ("success_at_end", "max"): "Table 8: success_at_end, maximum over evaluations",
-}
-PAPER_LAMBDAS = {
-    "ppo_aib": "0.666 ± 0.072",
-    "ppo_aib_lambda_0.1": "0.623 ± 0.081",
-    "ppo_aib_lambda_0.01": "0.446 ± 0.011",
-}
+RESULTS_ROWS = [  # of README: task, setting; no setting: not run with pictures
+    ("RememberShapeAndColor3x2-v0", ""),
+    ("RememberColor9-v0", ""),
+    ("InterceptMedium-v0", ""),
+    ("InterceptFast-v0", ""),
+    ("RememberColor3-v0", "white noise"),
+    ("RememberColor3-v0", "coloured noise"),
+    ("RememberColor5-v0", "white noise, beta 10"),
+]
+BELIEF_ROWS = [  # of docs/results.md: task and setting of stage 2
+    ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.01, unclipped"),
+    ("RememberColor5-v0", "2000 episodes, 600 updates, stage-1 KL 0.003"),
+    ("RememberColor5-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, beta 10"),
+    ("RememberShapeAndColor3x2-v0", "640 episodes, 600 updates, stage-1 KL 0.01, unclipped"),
+    ("RememberShapeAndColor3x2-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
+    ("RememberShapeAndColor3x2-v0", "2000 episodes, 2400 updates, stage-1 KL 0.003, beta 10, image_shift 4"),
+    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003, 270 of them"),
+    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
+    ("RememberColor9-v0", "2000 episodes, 2400 updates, stage-1 KL 0.003, beta 10, image_shift 4"),
+    ("InterceptFast-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
+    ("InterceptFast-v0", "2000 episodes, 1400 updates, stage-1 KL 0.003"),
+    ("InterceptMedium-v0", "2000 episodes, 2400 updates, stage-1 KL 0.01"),
+]
+HEAD_SETTING = "2000 episodes, 700 updates, stage-1 KL 0.003"
+ORACLE_STEPS = (28800, 57600, 86400, 144000, 240000)
 
 
 @dataclass
 class Args:
-    runs: Path = Path("runs")
-    """folder of run directories"""
+    runs: Path | None = None
+    """report on this folder of run directories; none: rebuild README.md and docs/results.md"""
+    add: str = ""
+    """append the runs to benchmark/results under this name of their setting, which settings.csv should explain"""
     output: Path = Path("benchmark/report")
-    """folder for report.md and the figures"""
-    small: bool = False
-    """report the --small runs"""
+    """where the report on --runs goes"""
 
 
-@dataclass
-class Run:
-    """One seed: the columns of eval.csv as arrays, and whether the run is finished."""
-
-    seed: int
-    finished: bool
-    quick: bool
-    share: float
-    columns: dict[str, np.ndarray]
+# ---------------------------------------------------------------- data
 
 
-def read_runs(folder: Path) -> dict[tuple[str, str], list[Run]]:
-    """Every run with an eval.csv below folder, by task and experiment name, seeds in order."""
-    runs = defaultdict(list)
+def read(name: str) -> list[dict[str, str]]:
+    """The rows of one of benchmark/results' CSV files."""
+    with (RESULTS / name).open() as file:
+        return list(csv.DictReader(file))
+
+
+def eval_rows(folder: Path, setting: str) -> list[dict]:
+    """Rows as in eval.csv of all runs in a folder; setting "" names each by its exp_name. --quick runs are left out."""
+    rows = []
     for file in sorted(folder.glob("*__*__*/eval.csv")):
         args = json.loads((file.parent / "args.json").read_text())
-        rows = list(csv.DictReader(file.open()))
-        columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-        share = columns["global_step"][-1] / args["total_timesteps"]
-        per_iteration = columns["global_step"][-1] / columns["iteration"][-1]
-        finished = columns["global_step"][-1] + per_iteration > args["total_timesteps"]
-        runs[args["env_id"], args["exp_name"]].append(Run(args["seed"], finished, args["quick"], share, columns))
-    return {key: sorted(found, key=lambda run: run.seed) for key, found in runs.items()}
+        script = re.match("[a-z]+_[a-z]+", args["exp_name"])[0]
+        if args["quick"] or script not in METHODS:
+            continue
+        run = {"task": args["env_id"], "method": METHODS[script], "seed": args["seed"]}
+        run["setting"] = setting or args["exp_name"]
+        for row in csv.DictReader(file.open()):
+            metrics = {name: f"{float(row[name]):.4f}" for name in METRICS if name in row}
+            rows.append({**run, "step": row["global_step"], **metrics})
+    return rows
 
 
-def statistic(run: Run, column: str, which: str) -> float:
-    """The paper's summary of one run: mean of the last three evaluations, or the maximum."""
-    values = run.columns[column]
-    return float(values[-3:].mean() if which == "last" else values.max())
+def belief_rows(folder: Path, setting: str) -> list[dict]:
+    """Rows as in beliefs.csv of all diagnostics.json in a folder, at every fifth time step, 4, 9 and the last."""
+    rows = []
+    for file in sorted(folder.glob("*__*__*/diagnostics.json")):
+        args = json.loads((file.parent / "args.json").read_text())
+        run = {"task": args["env_id"], "method": HEADS[args.get("action_head")], "seed": args["seed"]}
+        run["setting"] = setting or args["exp_name"]
+        for metric, values in json.loads(file.read_text()).items():
+            if not isinstance(values, list):
+                rows.append({**run, "step": "", "metric": metric, "value": f"{values:.3f}"})
+                continue
+            for step in sorted({4, 9, len(values) - 1, *range(0, len(values), 5)}):
+                rows.append({**run, "step": step, "metric": metric, "value": f"{values[step]:.3f}"})
+    return rows
 
 
-def interquartile_mean(values: np.ndarray) -> float:
-    """Mean of the middle half of the values; runs at the edge of it count in part."""
-    values, quarter = np.sort(values), len(values) / 4
-    places = np.arange(len(values))
-    weights = np.clip(np.minimum(places + 1, len(values) - quarter) - np.maximum(places, quarter), 0, 1)
-    return float((weights * values).sum() / weights.sum())
+def append(name: str, columns: list[str], rows: list[dict]) -> None:
+    """Add rows to one of benchmark/results' CSV files."""
+    with (RESULTS / name).open("a", newline="") as file:
+        csv.DictWriter(file, columns, restval="", lineterminator="\n").writerows(rows)
+
+
+def by_seed(rows: list[dict], column: str, **chosen: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Steps and values of a column by seed, of the rows whose other columns are as chosen."""
+    found = defaultdict(list)
+    for row in rows:
+        if all(row[name] == value for name, value in chosen.items()) and row.get(column):
+            found[row["seed"]].append((float(row["step"] or 0), float(row[column])))
+    return {seed: tuple(np.array(sorted(pairs)).T) for seed, pairs in found.items()}
+
+
+def last_three(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[float]:
+    """The paper's summary of each seed: the mean of the last three evaluations."""
+    return [values[-3:].mean() for _, values in curves.values()]
 
 
 def summarise(values: list[float]) -> str:
-    """Mean ± sample standard deviation over seeds; from three on also the interquartile mean with a 95 % interval."""
-    x = np.array(values)
-    if len(x) == 1:
-        return f"{x[0]:.2f} (1 seed)"
-    text = f"{x.mean():.2f} ± {x.std(ddof=1):.2f} ({len(x)} seeds)"
-    if len(x) > 2:
-        rng = np.random.default_rng(0)
-        low, high = np.quantile([interquartile_mean(rng.choice(x, len(x))) for _ in range(2000)], [0.025, 0.975])
-        text += f", IQM {interquartile_mean(x):.2f} [{low:.2f}, {high:.2f}]"
+    """Mean ± sample standard deviation (n); from three seeds on with the 95 % bootstrap interval of the mean."""
+    if not values:
+        return ""
+    if len(values) == 1:
+        return f"{values[0]:.2f} (1)"
+    text = f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} ({len(values)})"
+    if len(values) > 2 and np.std(values) > 0:
+        low, high = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+        text += f" [{low:.2f}, {high:.2f}]"
     return text
 
 
-def cell(runs: list[Run] | None, column: str, which: str) -> str:
-    """What the table says of one task and method: numbers, and what is missing, unfinished or only a trial."""
-    if not runs:
-        return "missing"
-    done = [statistic(run, column, which) for run in runs if run.finished and not run.quick]
-    going = [run for run in runs if not run.finished]
-    notes = [f"seed {run.seed} unfinished ({run.share:.0%}): {statistic(run, column, which):.2f}" for run in going]
-    notes += [f"seed {run.seed} is a --quick trial" for run in runs if run.finished and run.quick]
-    return "; ".join(([summarise(done)] if done else []) + notes)
-
-
-def main_table(runs: dict, key: tuple[str, str]) -> str:
-    """One of the paper's four tables in Markdown, ours beside the paper's."""
-    head = "| task | " + " | ".join(f"{name} | {name} (paper's)" for name in METHODS.values()) + " |"
-    lines = [f"## {TITLES[key]}", "", head, "|" + "---|" * 7]
-    for task, short in TASKS.items():
-        cells = [(cell(runs.get((task, name)), *key), PAPER[key][short][i]) for i, name in enumerate(METHODS)]
-        lines.append(f"| {short} | " + " | ".join(f"{ours} | {paper}" for ours, paper in cells) + " |")
+def markdown(head: list[str], rows: list[list[str]]) -> str:
+    """A table."""
+    lines = ["| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows]]
     return "\n".join(lines)
 
 
-def read_beliefs(folder: Path) -> dict[str, dict[tuple[str, str], list[dict]]]:
-    """diagnostics.json of every --small belief below folder, a list over seeds by task and (method, setting).
+# ---------------------------------------------------------------- tables
 
-    Both are read from args.json; a "note" in it tells what stage 2's arguments cannot.
+
+def results_table(evals: list[dict]) -> str:
+    """README's: per task success_once of the paper and here, mean of the last three evaluations, mean ± std (seeds)."""
+    paper = {(row["task"], row["method"]): row for row in read("paper.csv") if row["metric"] == "success_once"}
+    rows = []
+    for task, setting in RESULTS_ROWS:
+        row = [task.removesuffix("-v0"), f"{CHANCE[task]:.2f}" if task in CHANCE else ""]
+        for method in METHODS.values():
+            theirs = paper.get((task, method))
+            row.append(f"{theirs['last']} ± {theirs['last_std']}" if theirs else "")
+        steps = []
+        for method in METHODS.values():
+            curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
+            steps += [int(curve[0][-1]) for curve in curves.values()]
+            row.append(summarise(last_three(curves)).split(" [")[0])
+        rows.append([*row, f"{max(steps):,}" if steps else "", setting])
+    head = ["task", "chance", *[f"{method}, paper" for method in METHODS.values()]]
+    head += [*[f"{method}, here" for method in METHODS.values()], "steps", "setting"]
+    return markdown(head, rows)
+
+
+def agents_table(evals: list[dict]) -> str:
+    """All agents with pictures: success_once and success_at_end."""
+    rows = []
+    for task, method, setting in sorted({(row["task"], row["method"], row["setting"]) for row in evals}):
+        if method in METHODS.values():
+            chosen = {"task": task, "method": method, "setting": setting}
+            steps = max(curve[0][-1] for curve in by_seed(evals, "success_once", **chosen).values())
+            cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
+            rows.append([task.removesuffix("-v0"), method, setting, f"{steps:,.0f}", *cells])
+    return markdown(["task", "method", "setting", "steps", *METRICS[:2]], rows)
+
+
+def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str) -> str:
+    """A metric at the last time step, mean ± std (seeds)."""
+    curves = by_seed(beliefs, "value", task=task, method=method, setting=setting, metric=metric)
+    return summarise([values[-1] for _, values in curves.values()]).split(" [")[0]
+
+
+def beliefs_table(beliefs: list[dict]) -> str:
+    """What AIB's beliefs know at the last step of held-out random episodes."""
+    rows = []
+    for task, setting in BELIEF_ROWS:
+        cells = []
+        for metric in ("cue_from_h", "cue_from_particle", "u_r2_prior"):
+            cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
+        chance = by_seed(beliefs, "value", task=task, setting=setting, metric="cue_chance")
+        rows.append([task.removesuffix("-v0"), setting, f"{next(iter(chance.values()))[1][0]:.2f}", *cells])
+    return markdown(["task", "setting", "chance", "cue from h", "cue from particles", "R² of u"], rows)
+
+
+def heads_table(beliefs: list[dict]) -> str:
+    """The action heads and Believer on the same episodes and u."""
+    rows = []
+    for task in ("RememberShapeAndColor3x2-v0", "InterceptFast-v0"):
+        for method in HEADS.values():
+            cells = []
+            for metric in ("cue_from_particle", "u_r2_prior", "nll_prior", "nll_posterior", "action_readout"):
+                cells.append(belief_cell(beliefs, task, method, HEAD_SETTING, metric))
+            rows.append([task.removesuffix("-v0"), method, *cells])
+    head = ["task", "head", "cue from particles", "R² of u", "−log p(u), prior", "posterior", "R² of a_t"]
+    return markdown(head, rows)
+
+
+def oracle_table(evals: list[dict]) -> str:
+    """PPO without pictures on the privileged state, on u or on the target position: success_once of each seed.
+
+    The last evaluation until each step.
     """
-    found = defaultdict(lambda: defaultdict(list))
-    for file in sorted(folder.glob("*_small*__*/diagnostics.json")):
-        args = json.loads((file.parent / "args.json").read_text())
-        head, size = args.get("action_head"), (args["num_episodes"], args["num_updates"])
-        setting = f"{size[0]:,} episodes, {size[1]:,} updates"
-        for name, default in BELIEF_DEFAULTS.items():
-            if args.get(name, default) != default:
-                setting += f", {name} {args[name]}"
-        if "note" in args:
-            setting += f", {args['note']}"
-        place = size, setting, list(BELIEFS).index(head)  # rows in this order
-        found[args["env_id"]][*place, BELIEFS[head]].append(json.loads(file.read_text()))
-    return {task: {(key[3], key[1]): rows[key] for key in sorted(rows)} for task, rows in found.items()}
+    rows = []
+    for task, method, setting in sorted({(row["task"], row["method"], row["setting"]) for row in evals}):
+        if not method.startswith("oracle") or "learning_rate" in setting:
+            continue
+        curves = by_seed(evals, "success_once", task=task, method=method, setting=setting).values()
+        cells = []
+        for step in ORACLE_STEPS:
+            reached = [values[steps <= step][-1] for steps, values in curves if steps[-1] > 0.8 * step]
+            cells.append(", ".join(f"{value:.2f}" for value in reached))
+        rows.append([task.removesuffix("-v0"), method.removeprefix("oracle "), setting, *cells])
+    return markdown(["task", "the policy sees", "setting", *[f"{step:,}" for step in ORACLE_STEPS]], rows)
 
 
-def belief_cell(reports: list[dict], column: str) -> str:
-    """Numbers by step where there are such, mean over seeds and from two on their sample deviation."""
-    if column not in reports[0]:
-        return "–"
-    values = [r[column] if isinstance(r[column], list) else [r[column]] for r in reports]
-    steps = [4, 9, 30, -1] if len(values[0]) > 1 else [0]
-    cells = []
-    for step in steps:
-        x = np.array([row[step] for row in values])
-        cells.append(f"{x.mean():.2f}" + (f" ± {x.std(ddof=1):.2f}" if len(x) > 1 else ""))
-    return " / ".join(cells)
+def shift_table(evals: list[dict]) -> str:
+    """Success, and R² of u at the last step, on the agent's own episodes: at the first, middle and last evaluation."""
+    rows = []
+    runs = sorted({(row["task"], row["method"], row["setting"]) for row in evals if row["u_r2_at_end"]})
+    for task, method, setting in runs:
+        chosen = {"task": task, "method": method, "setting": setting}
+        known = by_seed(evals, "u_r2_at_end", **chosen)
+        for seed, (steps, success) in by_seed(evals, "success_once", **chosen).items():
+            cells = []
+            for i in (0, len(steps) // 2, -1):
+                cells += [f"{steps[i]:,.0f}", f"{success[i]:.2f}", f"{known[seed][1][i]:.2f}"]
+            rows.append([task.removesuffix("-v0"), method, setting, seed, *cells])
+    return markdown(["task", "method", "setting", "seed", *["steps", "success_once", "R² of u"] * 3], rows)
 
 
-def belief_table(task: str, rows: dict[tuple[str, str], list[dict]]) -> str:
-    """What the beliefs of one task remember of held-out episodes, in Markdown."""
-    first = next(iter(rows.values()))[0]
-    head = f"{task}: steps 4 / 9 / 30 / last; cue: chance {first['cue_chance']:.2f}"
-    lines = [
-        head,
-        "",
-        "| belief | seeds | " + " | ".join(BELIEF_COLUMNS) + " |",
-        "|" + "---|" * (len(BELIEF_COLUMNS) + 2),
-    ]
-    for (method, setting), reports in rows.items():
-        cells = [belief_cell(reports, column) for column in BELIEF_COLUMNS.values()]
-        lines.append(f"| {method}, {setting} | {len(reports)} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def phi_table(beliefs: list[dict]) -> str:
+    """How much of u's variance at the last step is linear in the target position, the cue, and their products."""
+    rows = []
+    for task, setting in sorted({(row["task"], row["setting"]) for row in beliefs if row["method"] == "phi"}):
+        cells = []
+        for metric in ("share_target", "share_cue", "share_target_x_cue", "target_error_cm"):
+            curves = by_seed(beliefs, "value", task=task, setting=setting, metric=metric)
+            cells.append(f"{curves['1'][1][-1]:.2f}")
+        rows.append([task.removesuffix("-v0"), setting, *cells])
+    return markdown(["task", "stage 1", "position", "cue", "position × cue", "error of the position, cm"], rows)
 
 
-def belief_figure(beliefs: dict, path: Path) -> None:
-    """Cue and R² of u from the mean particle against the time step, three tasks in a row, mean ± std over seeds.
-
-    Of each task the setting that most beliefs share, or all of them where no two beliefs share one; dashed the flow
-    belief of any setting that knows most of u at the last step.
-    """
-    height = -(-len(beliefs) // 3)
-    figure = plt.figure(figsize=(15, 6.5 * height), layout="constrained")
-    for part, (task, rows) in zip(figure.subfigures(height, 3, squeeze=False).flat, beliefs.items(), strict=False):
-        axes, beliefs_of = part.subplots(2, 1), Counter()
-        for (_, setting), reports in rows.items():
-            beliefs_of[setting] += len(reports)
-        flow = [row for row in rows if row[0] == BELIEFS["flow"]]
-        best = max(flow, key=lambda row: np.mean([report["u_r2_prior"][-1] for report in rows[row]]), default=None)
-        for ax, name, title in zip(axes, ("cue_from_particle", "u_r2_prior"), ("cue", "R² of u"), strict=True):
-            for (method, setting), reports in rows.items():
-                shared = beliefs_of[setting] == max(beliefs_of.values())
-                if shared or (method, setting) == best:
-                    values = np.array([report[name] for report in reports])
-                    mean, spread = values.mean(0), values.std(0, ddof=len(reports) > 1)
-                    label = textwrap.fill(f"{method}, {setting} ({len(reports)})", 60)
-                    (line,) = ax.plot(mean, "-" if shared else "--", label=label)
-                    ax.fill_between(range(len(mean)), mean - spread, mean + spread, color=line.get_color(), alpha=0.2)
-            ax.set(xlabel="step", ylabel=title, ylim=(-0.3, 1.05))
-            ax.grid(alpha=0.3)
-        axes[0].axhline(next(iter(rows.values()))[0]["cue_chance"], color="grey", linestyle=":", label="chance")
-        axes[0].set_title(task)
-        part.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", frameon=False)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+# ---------------------------------------------------------------- figures
 
 
-def small_report(runs: dict, beliefs: dict, output: Path) -> None:
-    """small.md, small.png and belief.png: every task that was run with --small."""
-    tasks = sorted({task for task, _ in runs})
-    lines = ["# Runs with --small", "", "| task | measure | " + " | ".join(METHODS.values()) + " |", "|" + "---|" * 5]
-    figure, axes = plt.subplots(1, len(tasks), figsize=(5 * len(tasks) + 1, 4), layout="constrained", squeeze=False)
-    for ax, task in zip(axes[0], tasks, strict=True):
-        for column, which in PAPER:
-            cells = [cell(runs.get((task, f"{name}_small")), column, which) for name in METHODS]
-            measure = f"{column}, {'mean of the last three' if which == 'last' else 'maximum'}"
-            lines.append(f"| {task} | {measure} | " + " | ".join(cells) + " |")
-        refreshed = [runs.get((task, f"{name}_refreshed_small")) for name in METHODS]
-        if any(refreshed):
-            cells = [cell(found, "success_once", "last") if found else "–" for found in refreshed]
-            lines.append(f"| {task} | the first of these, belief refreshed (refresh.py) | " + " | ".join(cells) + " |")
-        for (method, label), found in zip(METHODS.items(), refreshed, strict=True):
-            draw(ax, runs.get((task, f"{method}_small")), "success_once", label, COLOURS[method])
-            if found:
-                draw(ax, found, "success_once", f"{label}, belief refreshed", COLOURS[method], "--")
-        ax.set_title(task)
-    finish(figure, axes[0], "success_once", output / "small.png")
-    lines += ["", "![success_once](small.png)", ""]
-    if beliefs:
-        belief_figure(beliefs, output / "belief.png")
-        shown = "The figure shows of each task the setting that most beliefs share and, dashed, the flow belief of any "
-        shown += "setting that knows most of u at the last step; in brackets: seeds."
-        lines += ["# What the beliefs remember of held-out episodes", "", shown, ""]
-        lines += ["![cue and u from the mean particle](belief.png)"]
-        lines += ["\n" + belief_table(task, rows) for task, rows in beliefs.items()]
-    (output / "small.md").write_text("\n".join(lines) + "\n")
-    print(f"{output / 'small.md'}: {', '.join(tasks)}")
-
-
-def variant_table(runs: dict, title: str, variants: dict[str, str], paper: dict[str, str]) -> str:
-    """An ablation on InterceptFast-v0: success_once, mean of the last three evaluations."""
-    lines = [f"## {title}", "", "| variant | success_once | paper's |", "|---|---|---|"]
-    for name, label in variants.items():
-        ours = cell(runs.get(("InterceptFast-v0", name)), "success_once", "last")
-        lines.append(f"| {label} | {ours} | {paper.get(name, 'only a figure')} |")
-    return "\n".join(lines)
-
-
-def draw(axes: plt.Axes, runs: list[Run] | None, column: str, label: str, colour: str | None, style: str = "-") -> None:
-    """One learning curve: mean over seeds at the steps all of them have, shaded by the standard deviation."""
-    runs = [run for run in runs or [] if not run.quick]
-    if not runs:
-        axes.plot([], [], color=colour, label=f"{label} (missing)")
+def draw(axes: plt.Axes, curves: dict[str, tuple[np.ndarray, np.ndarray]], label: str, colour: str | None) -> None:
+    """Mean over seeds at the steps all of them have, shaded by the standard deviation."""
+    if not curves:
         return
-    length = min(len(run.columns["global_step"]) for run in runs)
-    steps = runs[0].columns["global_step"][:length]
-    values = np.stack([run.columns[column][:length] for run in runs])
-    seeds = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"
-    unfinished = "" if all(run.finished for run in runs) else ", unfinished"
-    (line,) = axes.plot(steps, values.mean(0), style, color=colour, label=f"{label} ({seeds}{unfinished})")
-    if len(runs) > 1:
+    length = min(len(steps) for steps, _ in curves.values())
+    steps = next(iter(curves.values()))[0][:length]
+    values = np.stack([values[:length] for _, values in curves.values()])
+    (line,) = axes.plot(steps, values.mean(0), color=colour, label=label)
+    if len(curves) > 1:
         spread = values.std(0, ddof=1)
         axes.fill_between(steps, values.mean(0) - spread, values.mean(0) + spread, color=line.get_color(), alpha=0.2)
 
 
-def finish(figure: plt.Figure, axes: np.ndarray, column: str, path: Path) -> None:
-    """Label the axes and save the figure."""
-    for ax in axes:
-        ax.set(xlabel="environment steps", ylabel=column, ylim=(-0.02, 1.02))
-        if not any(len(line.get_xdata()) for line in ax.lines):
-            ax.set_xticks([])  # no runs, no scale
+def save_figure(figure: plt.Figure, axes: np.ndarray, path: Path) -> None:
+    """One legend below all panels; the same bytes each time."""
+    entries = {}
+    for ax in np.ravel(axes):
         ax.grid(alpha=0.3)
-        ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, frameon=False)
-    figure.savefig(path, dpi=110)
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries[label] = handle
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries), frameon=False)
+    figure.savefig(path, dpi=100, metadata={"Software": None})
     plt.close(figure)
 
 
-def main(args: Args) -> None:
-    """Write the report; fails with one sentence when there is no run to report on."""
-    runs = read_runs(args.runs)
-    if args.small:
-        runs = {(task, name): found for (task, name), found in runs.items() if name.endswith("_small")}
-    if not runs:
-        kind = "eval.csv of a --small run" if args.small else "eval.csv"
-        print(f"error: no {kind} below {args.runs}; name the folder of run directories with --runs", file=sys.stderr)
+def learning_curves(evals: list[dict], path: Path) -> None:
+    """success_once of the three methods in every row of RESULTS_ROWS that has runs, with the chance level."""
+    panels = []
+    for task, setting in RESULTS_ROWS:
+        if by_seed(evals, "success_once", task=task, setting=setting):
+            panels.append((task, setting))
+    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 3.2), layout="constrained", sharey=True)
+    for ax, (task, setting) in zip(axes, panels, strict=True):
+        for method in METHODS.values():
+            curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
+            draw(ax, curves, method, COLOURS[method])
+        ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
+        ax.set(title=f"{task.removesuffix('-v0')}, {setting}", xlabel="environment steps", ylim=(0, 1.02))
+    axes[0].set_ylabel("success_once")
+    save_figure(figure, axes, path)
+
+
+def belief_figure(beliefs: list[dict], path: Path) -> None:
+    """Cue and R² of u from the mean particle by time step: action heads and Believer at the same setting."""
+    columns = [("RememberColor3-v0", BELIEF_ROWS[0][1])]
+    columns += [("RememberShapeAndColor3x2-v0", HEAD_SETTING), ("InterceptFast-v0", HEAD_SETTING)]
+    figure, axes = plt.subplots(2, 3, figsize=(12, 5.5), layout="constrained", sharex="col")
+    metrics = {"cue_from_particle": "cue", "u_r2_prior": "R² of u"}
+    for (task, setting), column in zip(columns, axes.T, strict=True):
+        for ax, (metric, label) in zip(column, metrics.items(), strict=True):
+            for method in HEADS.values():
+                curves = by_seed(beliefs, "value", task=task, method=method, setting=setting, metric=metric)
+                draw(ax, curves, method, COLOURS[method])
+            ax.set(ylabel=label, ylim=(-0.3, 1.05))
+        chance = by_seed(beliefs, "value", task=task, setting=setting, metric="cue_chance")
+        column[0].axhline(next(iter(chance.values()))[1][0], color="grey", linestyle=":", label="chance")
+        column[0].set_title(task.removesuffix("-v0"))
+        column[1].set_xlabel("time step")
+    save_figure(figure, axes, path)
+
+
+# ---------------------------------------------------------------- pages
+
+
+def replace_tables(page: str, tables: dict[str, str]) -> str:
+    """The page with every table between <!-- name --> and <!-- end --> made anew."""
+    for name, table in tables.items():
+        page = re.sub(rf"(<!-- {name} -->\n).*?(<!-- end -->)", rf"\g<1>{table}\n\g<2>", page, flags=re.DOTALL)
+    return page
+
+
+def rebuild(output: Path) -> None:
+    """README.md, docs/results.md and their figures, below output."""
+    evals, beliefs = read("eval.csv"), read("beliefs.csv")
+    tables = {"results": results_table(evals), "agents": agents_table(evals), "beliefs": beliefs_table(beliefs)}
+    tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "phi": phi_table(beliefs)}
+    tables["shift"] = shift_table(evals)
+    for page in ("README.md", "docs/results.md"):
+        (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
+    learning_curves(evals, output / "benchmark" / "results" / "learning_curves.png")
+    belief_figure(beliefs, output / "benchmark" / "results" / "beliefs.png")
+
+
+def own_beliefs(beliefs: list[dict], task: str) -> str:
+    """The beliefs of one task by setting (exp_name): metrics at the last time step of held-out random episodes."""
+    metrics = {"cue_from_h": "cue from h", "cue_from_particle": "cue from particles", "u_r2_prior": "R² of u"}
+    metrics |= {"nll_prior": "−log p(u), prior", "nll_posterior": "posterior"}
+    metrics |= {"action_readout": "R² of a_t", "flow_gain": "flow gain"}
+    rows = []
+    for setting, method in sorted({(row["setting"], row["method"]) for row in beliefs if row["task"] == task}):
+        rows.append([setting, *[belief_cell(beliefs, task, method, setting, metric) for metric in metrics]])
+    return markdown([task, *metrics.values()], rows)
+
+
+def own_runs(evals: list[dict], task: str) -> str:
+    """The runs of one task by setting (exp_name), below the paper's: last values and maxima."""
+    rows = []
+    for row in read("paper.csv"):
+        if row["task"] == task:
+            cells = [f"{row['last']} ± {row['last_std']} (3)", f"{row['max']} ± {row['max_std']} (3)"]
+            rows.append([row["metric"], f"{row['method']}, the paper's", *cells])
+    for setting in sorted({row["setting"] for row in evals if row["task"] == task}):
+        for metric in METRICS[:2]:
+            curves = by_seed(evals, metric, task=task, setting=setting)
+            steps = min(int(steps[-1]) for steps, _ in curves.values())
+            maxima = [values.max() for _, values in curves.values()]
+            rows.append([metric, f"{setting}, {steps:,} steps", summarise(last_three(curves)), summarise(maxima)])
+    return markdown([task, "run", "mean of the last three (seeds)", "maximum (seeds)"], sorted(rows))
+
+
+def report_runs(args: Args) -> None:
+    """Tables and learning curves of a folder of runs, a row and a curve per exp_name."""
+    evals, beliefs = eval_rows(args.runs, ""), belief_rows(args.runs, "")
+    tasks = sorted({row["task"] for row in evals})
+    if not tasks:
+        print(f"error: no eval.csv below {args.runs}; name the folder of run directories with --runs", file=sys.stderr)
         sys.exit(2)
     args.output.mkdir(parents=True, exist_ok=True)
-    if args.small:
-        small_report(runs, read_beliefs(args.runs), args.output)
-        return
-    for column, name in (("success_once", "figure_2.png"), ("success_at_end", "figure_8.png")):
-        figure, axes = plt.subplots(1, 4, figsize=(18, 4), layout="constrained")
-        for ax, (task, short) in zip(axes, TASKS.items(), strict=True):
-            for method, label in METHODS.items():
-                draw(ax, runs.get((task, method)), column, label, COLOURS[method])
-            ax.set_title(short)
-        finish(figure, axes, column, args.output / name)
-    for variants, name in ((HEADS, "figure_3.png"), (LAMBDAS, "figure_4.png")):
-        figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")
-        for method, label in variants.items():
-            draw(ax, runs.get(("InterceptFast-v0", method)), "success_once", label, None)
-        ax.set_title("InterceptFast-v0")
-        finish(figure, [ax], "success_once", args.output / name)
-    parts = ["# Report", "Columns marked (paper's) are the paper's numbers, all others were measured in these runs."]
-    parts += [main_table(runs, key) for key in TITLES]
-    parts += ["![success_once](figure_2.png)", "![success_at_end](figure_8.png)"]
-    parts += [variant_table(runs, "Figure 3: action heads on InterceptFast-v0", HEADS, {}), "![heads](figure_3.png)"]
-    parts += [variant_table(runs, "Figure 4: weight of the flow loss on InterceptFast-v0", LAMBDAS, PAPER_LAMBDAS)]
-    parts += ["![weights](figure_4.png)"]
+    figure, axes = plt.subplots(1, len(tasks), figsize=(5 * len(tasks), 4), layout="constrained", squeeze=False)
+    for ax, task in zip(axes[0], tasks, strict=True):
+        for setting in sorted({row["setting"] for row in evals if row["task"] == task}):
+            draw(ax, by_seed(evals, "success_once", task=task, setting=setting), setting, None)
+        if task in CHANCE:
+            ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
+        ax.set(title=task, xlabel="environment steps", ylabel="success_once", ylim=(0, 1.02))
+    save_figure(figure, axes, args.output / "learning_curves.png")
+    parts = ["# Report", *[own_runs(evals, task) for task in tasks], "![success_once](learning_curves.png)"]
+    parts += [own_beliefs(beliefs, task) for task in sorted({row["task"] for row in beliefs})]
     (args.output / "report.md").write_text("\n\n".join(parts) + "\n")
-    print(f"{args.output / 'report.md'}: {sum(map(len, runs.values()))} runs")
+    print(f"{args.output / 'report.md'}: {', '.join(tasks)}")
+
+
+def main(args: Args) -> None:
+    """Rebuild the project's pages, report on runs, or add them to the results."""
+    if args.runs is None:
+        rebuild(ROOT)
+    elif args.add:
+        append("eval.csv", KEY + METRICS, eval_rows(args.runs, args.add))
+        append("beliefs.csv", [*KEY, "metric", "value"], belief_rows(args.runs, args.add))
+    else:
+        report_runs(args)
 
 
 if __name__ == "__main__":

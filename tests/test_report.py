@@ -1,8 +1,8 @@
-"""The benchmark's commands and its report, on small recorded runs with numbers one can check by hand."""
+"""The benchmark's commands and its report, on numbers one can check by hand, and the pages that it makes."""
 
+import csv
 import json
 import shlex
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,64 +19,87 @@ import experiments
 import report
 import u_geometry
 
-RECORDED = Path(__file__).parent / "recorded"
+TASK = "RememberShapeAndColor3x2-v0"
 
 
-def test_tables_against_numbers_computed_by_hand(tmp_path: Path) -> None:
-    report.main(report.Args(runs=RECORDED, output=tmp_path))
-    text = (tmp_path / "report.md").read_text()
-    tables = {part.split(":")[0]: part.splitlines() for part in text.split("## ")[1:]}
-    row = next(line for line in tables["Table 1"] if line.startswith("| RSC3x2"))
-    # last three: 0.6, 0.5, 0.8: mean 0.6333, sample deviation 0.1528; interquartile mean weighs them 1/6, 4/6, 1/6
-    assert "| 0.63 ± 0.15 (3 seeds), IQM 0.62 [0.50, 0.80] | 0.82 ± 0.04 |" in row
-    assert "| 0.50 (1 seed) | 0.76 ± 0.02 |" in row
-    assert "| seed 1 unfinished (33%): 0.05 | 0.04 ± 0.02 |" in row
-    assert next(line for line in tables["Table 1"] if line.startswith("| RC9")).count("missing") == 3
-    row = next(line for line in tables["Table 6"] if line.startswith("| RSC3x2"))
-    assert "| 0.41 ± 0.16 (3 seeds)" in row  # 1/3, 0.3, 0.6: mean 0.4111, deviation 0.1644
-    row = next(line for line in tables["Table 7"] if line.startswith("| RSC3x2"))
-    assert "| 0.80 ± 0.17 (3 seeds)" in row  # 0.9, 0.6, 0.9
-    row = next(line for line in tables["Table 8"] if line.startswith("| RSC3x2"))
-    assert "| 0.53 ± 0.06 (3 seeds)" in row  # 0.5, 0.5, 0.6
-    assert "| λ = 1 | 0.40 (1 seed) | 0.666 ± 0.072 |" in text and "| λ = 0.1 | 0.20 (1 seed) | 0.623 ± 0.081 |" in text
-    assert "| λ = 0.01 | missing | 0.446 ± 0.011 |" in text
-    assert "| MSE regression | seed 1 is a --quick trial | only a figure |" in text
-    for figure in ("figure_2.png", "figure_3.png", "figure_4.png", "figure_8.png"):
-        assert iio.imread(tmp_path / figure).std() > 10
+def record(runs: Path, exp_name: str, seed: int, success_once: list[float], quick: bool = False) -> None:
+    """A run directory with as many evaluations; success_at_end is half of success_once."""
+    path = runs / f"{TASK}__{exp_name}__{seed}"
+    path.mkdir(parents=True)
+    (path / "args.json").write_text(json.dumps({"env_id": TASK, "exp_name": exp_name, "seed": seed, "quick": quick}))
+    lines = ["iteration,global_step,success_once,success_at_end,return"]
+    lines += [f"{i},{1000 * i},{value},{value / 2},3.5" for i, value in enumerate(success_once, 1)]
+    (path / "eval.csv").write_text("\n".join(lines) + "\n")
 
 
-def test_small_runs_of_any_task(tmp_path: Path) -> None:
-    for seed, name in ((1, "ppo_aib"), (2, "ppo_aib"), (3, "ppo_aib"), (1, "ppo_aib_refreshed")):
-        run = tmp_path / f"X-v0__{name}_small__{seed}"
-        shutil.copytree(RECORDED / f"RememberShapeAndColor3x2-v0__ppo_aib__{seed}", run)
-        args = json.loads((run / "args.json").read_text())
-        (run / "args.json").write_text(json.dumps({**args, "env_id": "X-v0", "exp_name": f"{name}_small"}))
-    for seed, cue in ((1, 0.5), (2, 0.7)):
-        run = tmp_path / f"X-v0__aib_belief_small__{seed}"
-        run.mkdir()
-        (run / "args.json").write_text(
-            json.dumps({"env_id": "X-v0", "action_head": "mse", "num_episodes": 9, "num_updates": 1000, "note": "wet"})
-        )
-        lists = {name: [0.0] * 40 + [cue] for name in ("cue_from_h", "cue_from_particle", "u_r2_prior")}
-        numbers = dict.fromkeys(("cue_chance", "nll_prior", "nll_posterior", "action_readout"), 2 * cue)
-        (run / "diagnostics.json").write_text(json.dumps(lists | numbers))
-    report.main(report.Args(runs=tmp_path, output=tmp_path, small=True))
-    text = (tmp_path / "small.md").read_text()
-    values = "0.63 ± 0.15 (3 seeds), IQM 0.62 [0.50, 0.80]"
-    assert (
-        f"| X-v0 | success_once, mean of the last three | {values} | missing | missing |" in text
-        and iio.imread(tmp_path / "small.png").std() > 10
-    )
-    assert "| X-v0 | the first of these, belief refreshed (refresh.py) | 0.60 (1 seed) | – | – |" in text
-    by_step = "0.00 ± 0.00 / 0.00 ± 0.00 / 0.00 ± 0.00 / 0.60 ± 0.14"
-    row = ["AIB, MSE regression, 9 episodes, 1,000 updates, wet", "2", *[by_step] * 3, *["1.20 ± 0.28"] * 3, "–", "–"]
-    assert "| " + " | ".join(row) + " |" in text
-    assert iio.imread(tmp_path / "belief.png").std() > 10
+def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
+    for seed, values in ((1, [0.9, 0.5, 0.6, 0.7]), (2, [0.1, 0.4, 0.5, 0.6]), (3, [0.0, 0.7, 0.8, 0.9])):
+        record(tmp_path, "ppo_aib", seed, values)
+    record(tmp_path, "ppo_baseline", 1, [0.0, 0.1, 0.3])
+    record(tmp_path, "ppo_believer_quick", 1, [1.0], quick=True)
+    belief = {"cue_from_h": [0.0] * 60 + [0.9], "cue_from_particle": [0.5] * 61, "u_r2_prior": [0.25] * 61}
+    belief |= {"nll_prior": -3.0, "nll_posterior": -4.0, "action_readout": 0.5}
+    path = tmp_path / f"{TASK}__aib_belief__1"
+    path.mkdir()
+    arguments = {"env_id": TASK, "exp_name": "aib_belief", "seed": 1, "action_head": "none"}
+    (path / "args.json").write_text(json.dumps(arguments))
+    (path / "diagnostics.json").write_text(json.dumps(belief))
+    report.main(report.Args(runs=tmp_path, output=tmp_path / "report"))
+    text = (tmp_path / "report" / "report.md").read_text()
+    # last three: 0.6, 0.5, 0.8: mean 0.6333, sample deviation 0.1528; maxima 0.9, 0.6, 0.9
+    aib = "0.63 ± 0.15 (3) [0.50, 0.80] | 0.80 ± 0.17 (3) [0.60, 0.90]"
+    assert f"| success_once | ppo_aib, 4,000 steps | {aib} |" in text
+    assert "| success_at_end | ppo_aib, 4,000 steps | 0.32 ± 0.08 (3) [0.25, 0.40] |" in text
+    assert "| success_once | ppo_baseline, 3,000 steps | 0.13 (1) | 0.30 (1) |" in text
+    assert "| success_once | AIB, the paper's | 0.82 ± 0.04 (3) | 0.87 ± 0.01 (3) |" in text
+    assert "| aib_belief | 0.90 (1) | 0.50 (1) | 0.25 (1) | -3.00 (1) | -4.00 (1) | 0.50 (1) |  |" in text
+    assert "quick" not in text
+    assert iio.imread(tmp_path / "report" / "learning_curves.png").std() > 10
 
 
-def test_interquartile_mean() -> None:
-    assert report.interquartile_mean([0.0, 1.0, 2.0, 100.0]) == 1.5
-    assert report.interquartile_mean([1.0, 2.0, 9.0]) == pytest.approx((0.25 * 1 + 1 * 2 + 0.25 * 9) / 1.5)
+def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    record(tmp_path, "ppo_aib_small", 3, [0.25, 0.5])
+    monkeypatch.setattr(report, "RESULTS", tmp_path)
+    (tmp_path / "eval.csv").write_text(",".join(report.KEY + report.METRICS) + "\n")
+    (tmp_path / "beliefs.csv").write_text(",".join([*report.KEY, "metric", "value"]) + "\n")
+    report.main(report.Args(runs=tmp_path, add="pink noise"))
+    rows = report.read("eval.csv")
+    assert [row["success_once"] for row in rows] == ["0.2500", "0.5000"]
+    assert rows[1] == dict(zip(report.KEY, [TASK, "AIB", "pink noise", "3", "2000"], strict=True)) | {
+        "success_once": "0.5000",
+        "success_at_end": "0.2500",
+        "return": "3.5000",
+        "u_r2": "",
+        "u_r2_at_end": "",
+    }
+
+
+def test_pages_and_figures_are_those_of_the_data(tmp_path: Path) -> None:
+    for folder in ("docs", "benchmark/results"):
+        (tmp_path / folder).mkdir(parents=True)
+    report.rebuild(tmp_path)
+    for page in ("README.md", "docs/results.md"):
+        assert (tmp_path / page).read_text() == (ROOT / page).read_text(), f"python benchmark/report.py changes {page}"
+    for name in ("learning_curves.png", "beliefs.png"):
+        made, kept = (iio.imread(root / "benchmark" / "results" / name) for root in (tmp_path, ROOT))
+        assert np.array_equal(made, kept), f"python benchmark/report.py changes {name}"
+
+
+def test_every_setting_of_the_results_is_explained() -> None:
+    explained = {row["setting"] for row in report.read("settings.csv")}
+    used = {row["setting"] for name in ("eval.csv", "beliefs.csv") for row in report.read(name)}
+    assert used == explained
+    for row in report.read("settings.csv"):
+        for script in ("aib_repr", "aib_belief"):
+            tyro.cli(SCRIPTS[script].Args, args=shlex.split(row[script]))
+        tyro.cli(SCRIPTS["ppo_aib"].Args, args=shlex.split(row["ppo"]))
+
+
+def test_rows_of_the_results_are_unique() -> None:
+    for name, key in (("eval.csv", report.KEY), ("beliefs.csv", [*report.KEY, "metric"])):
+        with (ROOT / "benchmark" / "results" / name).open() as file:
+            rows = [tuple(row[column] for column in key) for row in csv.DictReader(file)]
+        assert len(rows) == len(set(rows))
 
 
 def test_nothing_to_report(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
