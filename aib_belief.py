@@ -352,8 +352,8 @@ def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    size = QUICK if args.quick else SMALL if args.small else {}
-    if not (path / "repr.pt").exists() and args.repr_dir == size.get("repr_dir", Args.repr_dir):
+    default = QUICK["repr_dir"] if args.quick else SMALL["repr_dir"] if args.small else Args.repr_dir
+    if args.repr_dir == default and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "num_episodes")}
@@ -648,4 +648,4 @@ if __name__ == "__main__":
     try:
         main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")

@@ -472,8 +472,10 @@ def shaders_without_brdf_table() -> Iterator[None]:
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
         sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
-        yield
-        sapien.render.set_camera_shader_dir = set_shader_dir
+        try:
+            yield
+        finally:
+            sapien.render.set_camera_shader_dir = set_shader_dir
 
 
 def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
@@ -671,4 +673,4 @@ if __name__ == "__main__":
     try:
         main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")

@@ -464,21 +464,24 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // per_iteration)
     if args.num_minibatches > per_iteration:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
+    if not (CUDA or args.small or args.quick):
+        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
     checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
     if checkpoint.get("iteration") == num_iterations:
         print(f"{path} is finished; --overwrite recreates it")
         return
-    file, size = Path(args.belief.format(**vars(args))), QUICK if args.quick else SMALL if args.small else {}
-    if not file.exists() and args.belief == size.get("belief", Args.belief):
+    file = Path(args.belief.format(**vars(args)))
+    default = QUICK["belief"] if args.quick else SMALL["belief"] if args.small else Args.belief
+    if args.belief == default and not file.exists():
         run_stage("aib_belief.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_belief.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "num_episodes")}
     stored = load(file, hint, kind="aib_belief", **task)
-    begun = checkpoint.get("agent", {})
-    if any(not torch.equal(begun.get(f"belief.{name}", x), x) for name, x in stored["belief"].items()):
-        fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
+    for name, x in stored["belief"].items():
+        if checkpoint and not torch.equal(checkpoint["agent"][f"belief.{name}"], x):
+            fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
     open_run(path, args)
 
     envs, device = make_envs(args), torch.device(args.device)
@@ -607,8 +610,10 @@ def shaders_without_brdf_table() -> Iterator[None]:
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
         sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
-        yield
-        sapien.render.set_camera_shader_dir = set_shader_dir
+        try:
+            yield
+        finally:
+            sapien.render.set_camera_shader_dir = set_shader_dir
 
 
 def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
@@ -831,4 +836,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")

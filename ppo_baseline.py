@@ -332,6 +332,8 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // per_iteration)
     if args.num_minibatches > per_iteration:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
+    if not (CUDA or args.small or args.quick):
+        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
     checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
@@ -465,8 +467,10 @@ def shaders_without_brdf_table() -> Iterator[None]:
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
         sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
-        yield
-        sapien.render.set_camera_shader_dir = set_shader_dir
+        try:
+            yield
+        finally:
+            sapien.render.set_camera_shader_dir = set_shader_dir
 
 
 def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
@@ -668,4 +672,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")

@@ -433,8 +433,8 @@ def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    size = QUICK if args.quick else SMALL if args.small else {}
-    if not (path / "repr.pt").exists() and args.repr_dir == size.get("repr_dir", Args.repr_dir):
+    default = QUICK["repr_dir"] if args.quick else SMALL["repr_dir"] if args.small else Args.repr_dir
+    if args.repr_dir == default and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "num_episodes")}
@@ -659,6 +659,8 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // per_iteration)
     if args.num_minibatches > per_iteration:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
+    if not (CUDA or args.small or args.quick):
+        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
     checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
@@ -801,8 +803,10 @@ def shaders_without_brdf_table() -> Iterator[None]:
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
         sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
-        yield
-        sapien.render.set_camera_shader_dir = set_shader_dir
+        try:
+            yield
+        finally:
+            sapien.render.set_camera_shader_dir = set_shader_dir
 
 
 def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
@@ -1025,4 +1029,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes from the last checkpoint")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")
