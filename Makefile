@@ -49,7 +49,6 @@ test-gpu: setup
 	done
 
 bench: setup
-	$(PY) -m pip install --quiet --no-deps colorama  # MIKASA-Robo's own PPO script wants it
 	$(PY) benchmark/speed.py
 
 bench-belief: setup
