@@ -407,8 +407,10 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
         part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "z_mean": mean}
         part |= {"nll_prior": math.log(30) - log_p.logsumexp(-1), "nll_posterior": nll}
         part["posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
-        part = {name: x.transpose(0, 1) for name, x in {**part, "action": batch["actions"]}.items()}
-        parts.append({**part, "cue": batch["cue"]})
+        part["action"] = batch["actions"]
+        part = {name: x.transpose(0, 1) for name, x in part.items()}
+        part["cue"] = batch["cue"]
+        parts.append(part)
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -462,7 +464,7 @@ def main(args: Args) -> None:
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
-    config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints}
+    config["joints_dim"] = sample["joints"].shape[-1] if args.history_joints else 0
     config |= {"state_dim": len(stored["phi"]["mean"]), "u_dim": stored["u_dim"]}
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": AIBBelief(config, args.belief_amp)})

@@ -20,7 +20,6 @@ import signal
 import sys
 import tempfile
 import zipfile
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
@@ -291,16 +290,19 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
         seeds = (args.seed * 1_000_000 + rows) % 2**29 + 2**30  # above those of PPO's training, below its evaluation's
         obs, info = envs.reset(seed=seeds.tolist())
         cue = info["cue"]  # at the start: in Rotate tasks it is what is left to turn
-        buffer = defaultdict(list, rgb=[obs["rgb"]], joints=[obs["joints"]], state=[info["state"]])
+        step = {**obs, "state": info["state"]}
+        buffer = {name: [torch.as_tensor(x)] for name, x in step.items()} | {"rewards": [], "success": []}
         for t in range(steps):
-            obs, reward, _, _, info = envs.step(actions[:, t])
-            for name, x in (*obs.items(), ("state", info["state"]), ("rewards", reward), ("success", info["success"])):
-                buffer[name].append(x)
+            obs, rewards, _, _, info = envs.step(actions[:, t])
+            step = {**obs, "state": info["state"], "rewards": rewards, "success": info["success"]}
+            for name, x in step.items():
+                buffer[name].append(torch.as_tensor(x))
             bar.update(envs.num_envs)
-        buffer = {name: torch.stack([torch.as_tensor(x) for x in xs], 1) for name, xs in buffer.items()}
+        buffer = {name: torch.stack(xs, 1) for name, xs in buffer.items()}
         buffer |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue)}
         if not arrays:
-            if (size := buffer["rgb"][0].nbytes * count) > shutil.disk_usage(path.parent).free:
+            size = buffer["rgb"][0].nbytes * count
+            if size > shutil.disk_usage(path.parent).free:
                 fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free; lower --num-episodes")
             path.mkdir(exist_ok=True)
             for name, x in buffer.items():

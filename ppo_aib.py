@@ -151,7 +151,7 @@ SMALL = dict(exp_name="ppo_aib_small", total_timesteps=120_000, num_envs=16, num
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, eval_every=15, num_eval_episodes=64)
 SMALL |= dict(amp=BFLOAT16, num_episodes=640, belief="runs/{env_id}__aib_belief_small__{seed}/belief.pt")
 QUICK = dict(exp_name="ppo_aib_quick", num_episodes=8, total_timesteps=360, num_envs=2, num_eval_episodes=2)
-QUICK["belief"] = "runs/{env_id}__aib_belief_quick__{seed}/belief.pt"
+QUICK |= dict(num_minibatches=4, belief="runs/{env_id}__aib_belief_quick__{seed}/belief.pt")
 
 
 # ---------------------------------------------------------------- networks
@@ -382,7 +382,7 @@ def rollout(
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
             step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
             if deterministic:
-                step["state"] = torch.as_tensor(info["state"], device=device)
+                step["state"] = torch.as_tensor(info["state"], dtype=torch.float32, device=device)
             obs, rewards, _, _, info = envs.step(step["actions"].clamp(-1, 1).cpu().numpy())
             step["rewards"] = torch.as_tensor(rewards, dtype=torch.float32, device=device)
             step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
@@ -464,7 +464,7 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // per_iteration)
     if args.num_minibatches > per_iteration:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
-    if not (CUDA or args.small or args.quick):
+    if args.total_timesteps > 1_000_000 and not CUDA:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
@@ -535,7 +535,9 @@ def main(args: Args) -> None:
             metrics, video = evaluate(envs, agent, args)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
-            lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
+            lines = [",".join(rows[0])]
+            for row in rows:
+                lines.append(",".join(map(str, row.values())))
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
             content = {"kind": "ppo_aib agent", **asdict(args), "config": stored["config"]}

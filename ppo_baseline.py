@@ -135,7 +135,7 @@ TASKS = {  # Table 5, where it differs from the defaults above, which are Interc
 SMALL = dict(exp_name="ppo_baseline_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, eval_every=15, num_eval_episodes=64)
 SMALL |= dict(amp=BFLOAT16)
-QUICK = dict(exp_name="ppo_baseline_quick", total_timesteps=360, num_envs=2, num_eval_episodes=2)
+QUICK = dict(exp_name="ppo_baseline_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
 
 
 # ---------------------------------------------------------------- networks
@@ -332,7 +332,7 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // per_iteration)
     if args.num_minibatches > per_iteration:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
-    if not (CUDA or args.small or args.quick):
+    if args.total_timesteps > 1_000_000 and not CUDA:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
@@ -392,7 +392,9 @@ def main(args: Args) -> None:
             metrics, video = evaluate(envs, agent, args)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
-            lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
+            lines = [",".join(rows[0])]
+            for row in rows:
+                lines.append(",".join(map(str, row.values())))
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
             content = {"kind": "ppo_baseline agent", **asdict(args)}

@@ -182,7 +182,7 @@ SMALL = dict(exp_name="ppo_believer_small", total_timesteps=120_000, num_envs=16
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, eval_every=15, num_eval_episodes=64)
 SMALL |= dict(amp=BFLOAT16, num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
-QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_eval_episodes=2)
+QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
 QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_episodes=8, num_updates=4, batch_episodes=4)
 
 
@@ -499,7 +499,7 @@ def rollout(
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
             step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
             if deterministic:
-                step["state"] = torch.as_tensor(info["state"], device=device)
+                step["state"] = torch.as_tensor(info["state"], dtype=torch.float32, device=device)
             obs, rewards, _, _, info = envs.step(step["actions"].clamp(-1, 1).cpu().numpy())
             step["rewards"] = torch.as_tensor(rewards, dtype=torch.float32, device=device)
             step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
@@ -577,7 +577,7 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
     train, held_out = np.split(np.arange(args.num_episodes), [-stored["num_val"]])
     sample = episodes(train[:1])
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
-    config |= {"joints_dim": sample["joints"].shape[-1] * args.history_joints}
+    config["joints_dim"] = sample["joints"].shape[-1] if args.history_joints else 0
     config |= {"state_dim": len(stored["phi"]["mean"]), "u_dim": stored["u_dim"]}
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": BelieverBelief(config, args.belief_amp)})
@@ -659,7 +659,7 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // per_iteration)
     if args.num_minibatches > per_iteration:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
-    if not (CUDA or args.small or args.quick):
+    if args.total_timesteps > 1_000_000 and not CUDA:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
@@ -728,7 +728,9 @@ def main(args: Args) -> None:
             metrics, video = evaluate(envs, agent, args)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
             rows.append({"iteration": iteration, "global_step": global_step, **metrics})
-            lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
+            lines = [",".join(rows[0])]
+            for row in rows:
+                lines.append(",".join(map(str, row.values())))
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
             content = {"kind": "ppo_believer agent", **asdict(args), "config": stored["config"]}

@@ -56,7 +56,11 @@ class Args:
 def commands(args: Args) -> dict[int, list[list[str]]]:
     """The commands of each phase, as lists of words after `python`."""
     phases = {1: [], 2: [], 3: []}
-    size = ["--small"] * args.small + ["--quick"] * args.quick
+    size = []
+    if args.small:
+        size.append("--small")
+    if args.quick:
+        size.append("--quick")
     for task in args.tasks:
         for seed in args.seeds:
             run = ["--env-id", task, "--seed", str(seed), *size]

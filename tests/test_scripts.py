@@ -14,11 +14,11 @@ TREES = {name: ast.parse(source) for name, source in SOURCES.items()}
 SECTIONS = ["arguments", "networks", "losses", "data", "evaluation", "training", "simulator", "files and stages"]
 OWN = ("Args", "main", "evaluate_checkpoint", "SMALL", "QUICK", "LIMITS", "MAY_DIFFER", "TASKS")
 BUDGET = {  # a reader's: tokens of code, lines
-    "aib_repr": (5958, 676),
-    "aib_belief": (5895, 651),
-    "ppo_aib": (7319, 839),
-    "ppo_believer": (9316, 1032),
-    "ppo_baseline": (5805, 675),
+    "aib_repr": (5960, 678),
+    "aib_belief": (5894, 653),
+    "ppo_aib": (7328, 841),
+    "ppo_believer": (9324, 1034),
+    "ppo_baseline": (5806, 677),
 }
 
 

@@ -1,0 +1,87 @@
+"""AIB on a memory task of one's own, a plain Gymnasium environment whose pictures numpy draws.
+
+A point moves in a square. Its target is drawn in the first pictures only, so the agent must remember where it was.
+
+Usage:   python docs/examples/gymnasium_task.py --small
+Takes:   the arguments that all three stages share, such as --seed, --num-episodes or --overwrite; not --exp-name
+Writes:  what the three stages write, to runs/RememberTarget-v0__...
+"""
+
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+import aib_belief  # noqa: E402
+import aib_repr  # noqa: E402
+import ppo_aib  # noqa: E402
+
+TASK = "RememberTarget-v0"
+GREEN, WHITE = (0, 255, 0), (255, 255, 255)
+
+
+def draw_square(rgb: np.ndarray, place: np.ndarray, colour: tuple[int, int, int]) -> None:
+    """Draw 8 x 8 pixels at a place in [-1, 1] x [-1, 1]."""
+    column, row = ((place + 1) * 28).astype(int)
+    rgb[row : row + 8, column : column + 8] = colour
+
+
+class RememberTarget(gym.Env):
+    """One environment; gymnasium's vector environment stacks what several of them return."""
+
+    observation_space = gym.spaces.Dict(
+        rgb=gym.spaces.Box(0, 255, (64, 64, 3), np.uint8), joints=gym.spaces.Box(-1, 1, (2,), np.float32)
+    )
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        """Place the target. All chance comes from self.np_random, which the seed starts."""
+        super().reset(seed=seed)
+        self.t = 0
+        self.point = np.zeros(2, np.float32)
+        self.target = self.np_random.uniform(-0.9, 0.9, 2).astype(np.float32)
+        return self.observe()
+
+    def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
+        """Move the point. Success does not end the episode, and gym.make truncates it after max_episode_steps."""
+        self.t += 1
+        self.point = (self.point + 0.15 * action).clip(-1, 1)
+        obs, info = self.observe()
+        reward = 1 - float(np.linalg.norm(self.point - self.target)) / 3
+        return obs, reward, False, False, info
+
+    def observe(self) -> tuple[dict, dict]:
+        """Observation, and the info that only training sees."""
+        rgb = np.zeros((64, 64, 3), np.uint8)
+        draw_square(rgb, self.point, WHITE)
+        if self.t < 4:
+            draw_square(rgb, self.target, GREEN)
+        success = float(np.linalg.norm(self.point - self.target) < 0.2)
+        state = np.concatenate([self.target, self.point])
+        return {"rgb": rgb, "joints": self.point}, {"success": success, "state": state, "cue": self.target.copy()}
+
+
+gym.register(TASK, RememberTarget, max_episode_steps=20)
+
+
+def make_envs(args: object) -> gym.vector.VectorEnv:
+    """In place of the scripts' make_envs. For a slow simulator: "async", and args.num_workers environments."""
+    return gym.make_vec(TASK, args.num_envs, "sync", vector_kwargs={"autoreset_mode": "Disabled"})
+
+
+def main() -> None:
+    """Run the three stages one after another, with the arguments of the command line."""
+    sys.argv += ["--env-id", TASK]
+    for script in (aib_repr, ppo_aib):  # aib_belief.py has no simulator
+        script.make_envs = make_envs
+        script.check_task = lambda args: None
+    scripts = (aib_repr, aib_belief, ppo_aib)
+    arguments = [script.parse_args() for script in scripts]  # all before any runs: a mistake shows at once
+    for script, args in zip(scripts, arguments, strict=True):
+        script.main(args)
+
+
+if __name__ == "__main__":
+    main()
