@@ -99,4 +99,4 @@ vulkan: .venv/installed
 	    apt-get update
 	fi
 	apt-get install --yes --no-install-recommends $${release:+--target-release $$release} mesa-vulkan-drivers libvulkan1 libx11-6
-	renders cpu || { echo "error: the Vulkan driver is installed, and SAPIEN still cannot render; see README" >&2; exit 2; }
+	renders cpu || { echo "error: the Vulkan driver is installed, and SAPIEN still cannot render; see docs/experiments.md" >&2; exit 2; }

@@ -72,24 +72,24 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """with or without a camera at its wrist, through which the policy does not see"""
+    """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
     """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results differ by rounding only"""
     small: bool = False
-    """smaller than the paper, for a CPU and two hours; found on RememberColor3-v0"""
+    """smaller than the paper, for a CPU and an hour or two; tuned on RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
-    """delete what the run directory holds and start again, every time it is given"""
+    """delete what the run directory holds and start again; to resume, leave it out"""
 
     total_timesteps: int = 10_000_000
     """environment steps of training"""
     num_envs: int = 256
-    """episodes per iteration; on physx_cuda one batch, with one arm pose"""
+    """episodes per iteration; on physx_cuda all of them start from one arm pose"""
     learning_rate: float = 1e-4
-    """Adam's"""
+    """of Adam, constant"""
     update_epochs: int = 2
     """passes over an iteration's data"""
     num_minibatches: int = 32
@@ -107,7 +107,7 @@ class Args:
     max_grad_norm: float = 0.5
     """gradients are scaled down to this norm"""
     target_kl: float = 0.05
-    """an iteration's update ends when the policy has moved so far"""
+    """the update ends before the first minibatch whose approx_kl is larger"""
     eval_every: int = 25
     """iterations between evaluations"""
     num_eval_episodes: int = 192
@@ -572,7 +572,7 @@ def check_task(args: Args) -> None:
                 fcntl.flock(lock, fcntl.LOCK_EX)  # jobs that start together must not download its library together
                 sapien.physx.enable_gpu()
     except (OSError, RuntimeError, zipfile.BadZipFile) as error:
-        fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see README, Troubleshooting")
+        fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see docs/experiments.md")
 
 
 # ---------------------------------------------------------------- files and stages
@@ -592,7 +592,7 @@ def parse_args() -> Args:
         settings = settings | SMALL
     if chosen.quick:
         settings = settings | QUICK
-    args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings))
+    args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")
     if "/" in args.exp_name:
