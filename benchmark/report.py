@@ -44,18 +44,24 @@ RESULTS_ROWS = [  # of README: task, setting; no setting: not run with pictures
     ("InterceptFast-v0", ""),
     ("RememberColor3-v0", "white noise"),
     ("RememberColor3-v0", "coloured noise"),
-    ("RememberColor5-v0", "white noise, beta 10"),
+    ("RememberColor5-v0", "white noise, KL weight 10"),
 ]
 BELIEF_ROWS = [  # of docs/results.md: task and setting of stage 2
-    ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.01, unclipped"),
-    ("RememberColor5-v0", "2000 episodes, 600 updates, stage-1 KL 0.003"),
-    ("RememberColor5-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, beta 10"),
-    ("RememberShapeAndColor3x2-v0", "640 episodes, 600 updates, stage-1 KL 0.01, unclipped"),
+    ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.01, psi without images"),
+    ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.003"),
+    ("RememberColor5-v0", "2000 episodes, 600 updates, stage-1 KL 0.01"),
+    ("RememberColor5-v0", "2000 episodes, 600 updates, stage-1 KL 0.01, another u"),
+    ("RememberColor5-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003"),
+    ("RememberColor5-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10"),
+    ("RememberColor5-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10, image shift 4"),
     ("RememberShapeAndColor3x2-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
-    ("RememberShapeAndColor3x2-v0", "2000 episodes, 2400 updates, stage-1 KL 0.003, beta 10, image_shift 4"),
-    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003, 270 of them"),
+    ("RememberShapeAndColor3x2-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10"),
+    ("RememberShapeAndColor3x2-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10, image shift 4"),
+    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003, trained on 270"),
+    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003, trained on 900"),
     ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
-    ("RememberColor9-v0", "2000 episodes, 2400 updates, stage-1 KL 0.003, beta 10, image_shift 4"),
+    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003, KL weight 10"),
+    ("RememberColor9-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10, image shift 4"),
     ("InterceptFast-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
     ("InterceptFast-v0", "2000 episodes, 1400 updates, stage-1 KL 0.003"),
     ("InterceptMedium-v0", "2000 episodes, 2400 updates, stage-1 KL 0.01"),
@@ -136,16 +142,13 @@ def last_three(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[float]:
 
 
 def summarise(values: list[float]) -> str:
-    """Mean ± sample standard deviation (n); from three seeds on with the 95 % bootstrap interval of the mean."""
-    if not values:
-        return ""
-    if len(values) == 1:
-        return f"{values[0]:.2f} (1)"
-    text = f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} ({len(values)})"
-    if len(values) > 2 and np.std(values) > 0:
-        low, high = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
-        text += f" [{low:.2f}, {high:.2f}]"
-    return text
+    """Mean (each seed); from five seeds on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
+    if len(values) < 2:
+        return "".join(f"{value:.2f}" for value in values)
+    if len(values) < 5:
+        return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in sorted(values))})"
+    low, high = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} [{low:.2f}, {high:.2f}]"
 
 
 def markdown(head: list[str], rows: list[list[str]]) -> str:
@@ -158,7 +161,7 @@ def markdown(head: list[str], rows: list[list[str]]) -> str:
 
 
 def results_table(evals: list[dict]) -> str:
-    """README's: per task success_once of the paper and here, mean of the last three evaluations, mean ± std (seeds)."""
+    """README's: per task success_once of the paper and here, mean of the last three evaluations."""
     paper = {(row["task"], row["method"]): row for row in read("paper.csv") if row["metric"] == "success_once"}
     rows = []
     for task, setting in RESULTS_ROWS:
@@ -166,33 +169,33 @@ def results_table(evals: list[dict]) -> str:
         for method in METHODS.values():
             theirs = paper.get((task, method))
             row.append(f"{theirs['last']} ± {theirs['last_std']}" if theirs else "")
-        steps = []
         for method in METHODS.values():
-            curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
-            steps += [int(curve[0][-1]) for curve in curves.values()]
-            row.append(summarise(last_three(curves)).split(" [")[0])
-        rows.append([*row, f"{max(steps):,}" if steps else "", setting])
+            row.append(summarise(last_three(by_seed(evals, "success_once", task=task, method=method, setting=setting))))
+        rows.append([*row, setting])
     head = ["task", "chance", *[f"{method}, paper" for method in METHODS.values()]]
-    head += [*[f"{method}, here" for method in METHODS.values()], "steps", "setting"]
+    head += [*[f"{method}, here" for method in METHODS.values()], "setting"]
     return markdown(head, rows)
 
 
 def agents_table(evals: list[dict]) -> str:
     """All agents with pictures: success_once and success_at_end."""
     rows = []
+    repr_arguments = {row["setting"]: row["aib_repr"] for row in read("settings.csv")}
     for task, method, setting in sorted({(row["task"], row["method"], row["setting"]) for row in evals}):
         if method in METHODS.values():
             chosen = {"task": task, "method": method, "setting": setting}
-            steps = max(curve[0][-1] for curve in by_seed(evals, "success_once", **chosen).values())
+            steps = min(curve[0][-1] for curve in by_seed(evals, "success_once", **chosen).values())
+            episodes = re.search(r"--num-episodes (\d+)", repr_arguments[setting])
+            random_steps = 60 * int(episodes[1] if episodes else 640) if method != "PPO" else 0
             cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
-            rows.append([task.removesuffix("-v0"), method, setting, f"{steps:,.0f}", *cells])
-    return markdown(["task", "method", "setting", "steps", *METRICS[:2]], rows)
+            rows.append([task.removesuffix("-v0"), method, setting, f"{random_steps:,}", f"{steps:,.0f}", *cells])
+    return markdown(["task", "method", "setting", "random steps", "PPO steps", *METRICS[:2]], rows)
 
 
-def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str) -> str:
-    """A metric at the last time step, mean ± std (seeds)."""
+def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str, from_step: int = 999) -> str:
+    """A metric at the last time step, or its mean from a time step on."""
     curves = by_seed(beliefs, "value", task=task, method=method, setting=setting, metric=metric)
-    return summarise([values[-1] for _, values in curves.values()]).split(" [")[0]
+    return summarise([values[steps >= min(from_step, steps[-1])].mean() for steps, values in curves.values()])
 
 
 def beliefs_table(beliefs: list[dict]) -> str:
@@ -200,11 +203,11 @@ def beliefs_table(beliefs: list[dict]) -> str:
     rows = []
     for task, setting in BELIEF_ROWS:
         cells = []
-        for metric in ("cue_from_h", "cue_from_particle", "u_r2_prior"):
+        for metric in ("cue_from_u", "cue_from_h", "cue_from_particle", "u_r2_prior"):
             cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
         chance = by_seed(beliefs, "value", task=task, setting=setting, metric="cue_chance")
         rows.append([task.removesuffix("-v0"), setting, f"{next(iter(chance.values()))[1][0]:.2f}", *cells])
-    return markdown(["task", "setting", "chance", "cue from h", "cue from particles", "R² of u"], rows)
+    return markdown(["task", "setting", "chance", "cue from u", "cue from h", "cue from particles", "R² of u"], rows)
 
 
 def heads_table(beliefs: list[dict]) -> str:
@@ -213,10 +216,10 @@ def heads_table(beliefs: list[dict]) -> str:
     for task in ("RememberShapeAndColor3x2-v0", "InterceptFast-v0"):
         for method in HEADS.values():
             cells = []
-            for metric in ("cue_from_particle", "u_r2_prior", "nll_prior", "nll_posterior", "action_readout"):
-                cells.append(belief_cell(beliefs, task, method, HEAD_SETTING, metric))
+            for metric in ("cue_from_particle", "u_r2_prior", "nll_prior", "action_readout"):
+                cells.append(belief_cell(beliefs, task, method, HEAD_SETTING, metric, from_step=30))
             rows.append([task.removesuffix("-v0"), method, *cells])
-    head = ["task", "head", "cue from particles", "R² of u", "−log p(u), prior", "posterior", "R² of a_t"]
+    head = ["task", "head", "cue from particles", "R² of u", "−log p(u), prior", "R² of a_t"]
     return markdown(head, rows)
 
 
@@ -232,7 +235,7 @@ def oracle_table(evals: list[dict]) -> str:
         curves = by_seed(evals, "success_once", task=task, method=method, setting=setting).values()
         cells = []
         for step in ORACLE_STEPS:
-            reached = [values[steps <= step][-1] for steps, values in curves if steps[-1] > 0.8 * step]
+            reached = [values[steps <= step][-1] for steps, values in curves if steps[-1] > 0.95 * step]
             cells.append(", ".join(f"{value:.2f}" for value in reached))
         rows.append([task.removesuffix("-v0"), method.removeprefix("oracle "), setting, *cells])
     return markdown(["task", "the policy sees", "setting", *[f"{step:,}" for step in ORACLE_STEPS]], rows)
@@ -312,7 +315,7 @@ def learning_curves(evals: list[dict], path: Path) -> None:
 
 def belief_figure(beliefs: list[dict], path: Path) -> None:
     """Cue and R² of u from the mean particle by time step: action heads and Believer at the same setting."""
-    columns = [("RememberColor3-v0", BELIEF_ROWS[0][1])]
+    columns = [("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.01, unclipped")]
     columns += [("RememberShapeAndColor3x2-v0", HEAD_SETTING), ("InterceptFast-v0", HEAD_SETTING)]
     figure, axes = plt.subplots(2, 3, figsize=(12, 5.5), layout="constrained", sharex="col")
     metrics = {"cue_from_particle": "cue", "u_r2_prior": "R² of u"}
@@ -367,7 +370,7 @@ def own_runs(evals: list[dict], task: str) -> str:
     rows = []
     for row in read("paper.csv"):
         if row["task"] == task:
-            cells = [f"{row['last']} ± {row['last_std']} (3)", f"{row['max']} ± {row['max_std']} (3)"]
+            cells = [f"{row['last']} ± {row['last_std']}", f"{row['max']} ± {row['max_std']}"]
             rows.append([row["metric"], f"{row['method']}, the paper's", *cells])
     for setting in sorted({row["setting"] for row in evals if row["task"] == task}):
         for metric in METRICS[:2]:
@@ -375,7 +378,7 @@ def own_runs(evals: list[dict], task: str) -> str:
             steps = min(int(steps[-1]) for steps, _ in curves.values())
             maxima = [values.max() for _, values in curves.values()]
             rows.append([metric, f"{setting}, {steps:,} steps", summarise(last_three(curves)), summarise(maxima)])
-    return markdown([task, "run", "mean of the last three (seeds)", "maximum (seeds)"], sorted(rows))
+    return markdown([task, "run", "mean of the last three", "maximum"], sorted(rows))
 
 
 def report_runs(args: Args) -> None:

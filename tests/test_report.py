@@ -46,15 +46,23 @@ def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     (path / "diagnostics.json").write_text(json.dumps(belief))
     report.main(report.Args(runs=tmp_path, output=tmp_path / "report"))
     text = (tmp_path / "report" / "report.md").read_text()
-    # last three: 0.6, 0.5, 0.8: mean 0.6333, sample deviation 0.1528; maxima 0.9, 0.6, 0.9
-    aib = "0.63 ± 0.15 (3) [0.50, 0.80] | 0.80 ± 0.17 (3) [0.60, 0.90]"
+    # last three: 0.6, 0.5, 0.8: mean 0.6333; maxima 0.9, 0.6, 0.9
+    aib = "0.63 (0.50, 0.60, 0.80) | 0.80 (0.60, 0.90, 0.90)"
     assert f"| success_once | ppo_aib, 4,000 steps | {aib} |" in text
-    assert "| success_at_end | ppo_aib, 4,000 steps | 0.32 ± 0.08 (3) [0.25, 0.40] |" in text
-    assert "| success_once | ppo_baseline, 3,000 steps | 0.13 (1) | 0.30 (1) |" in text
-    assert "| success_once | AIB, the paper's | 0.82 ± 0.04 (3) | 0.87 ± 0.01 (3) |" in text
-    assert "| aib_belief | 0.90 (1) | 0.50 (1) | 0.25 (1) | -3.00 (1) | -4.00 (1) | 0.50 (1) |  |" in text
+    assert "| success_at_end | ppo_aib, 4,000 steps | 0.32 (0.25, 0.30, 0.40) |" in text
+    assert "| success_once | ppo_baseline, 3,000 steps | 0.13 | 0.30 |" in text
+    assert "| success_once | AIB, the paper's | 0.82 ± 0.04 | 0.87 ± 0.01 |" in text
+    assert "| aib_belief | 0.90 | 0.50 | 0.25 | -3.00 | -4.00 | 0.50 |  |" in text
     assert "quick" not in text
     assert iio.imread(tmp_path / "report" / "learning_curves.png").std() > 10
+
+
+def test_five_seeds_have_a_bootstrap_interval() -> None:
+    values = [0.1, 0.2, 0.3, 0.4, 0.5]
+    text = report.summarise(values)
+    assert text.startswith("0.30 ± 0.16 [")  # sample deviation 0.1581; the mean's standard error is near 0.063
+    low, high = text.split("[")[1].rstrip("]").split(", ")
+    assert 0.15 < float(low) < 0.2 and 0.4 < float(high) < 0.45
 
 
 def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
