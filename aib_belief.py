@@ -372,17 +372,23 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
 # ---------------------------------------------------------------- evaluation
 
 
+def are_classes(y: Tensor) -> bool:
+    """Whether a cue y (N, K) is one of few integers, a colour or a shape, and not a quantity like a velocity."""
+    return bool((y == y.round()).all()) and len(y.unique()) <= 32
+
+
 def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
-    """Linear probe of y (N, K) from x (N, F): R2, or accuracy of few integers, on x_test and y_test.
+    """Linear probe of y (N, K) from x (N, F): R2, or accuracy of classes, on x_test and y_test.
 
     The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
     """
     varies = y.amax(0) > y.amin(0)
     if not varies.any():
         return math.nan
+    model = linear_model.RidgeCV(np.logspace(-3, 4, 8))
+    if are_classes(y[:, varies]):
+        model = linear_model.LogisticRegression(max_iter=1000)
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
-    classify = not (y != y.round()).any() and len(np.unique(y)) <= 32
-    model = linear_model.LogisticRegression(max_iter=1000) if classify else linear_model.RidgeCV(np.logspace(-3, 4, 8))
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
     return float(np.mean([model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]))
 
@@ -431,8 +437,9 @@ def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
     action, action_test = (x["action"].flatten(0, 1) for x in (fit, test))
     report["action_readout"] = probe_score(pairs, action, pairs_test, action_test)
     cue = fit["cue"][:, fit["cue"].amax(0) > fit["cue"].amin(0)]
-    classes = [] if (cue != cue.round()).any() else [len(column.unique()) for column in cue.T]
-    report["cue_chance"] = float(np.mean([1 / n for n in classes])) if classes else 0.0
+    report["cue_chance"] = 0.0
+    if cue.numel() and are_classes(cue):
+        report["cue_chance"] = float(np.mean([1 / len(column.unique()) for column in cue.T]))
     return report
 
 

@@ -58,7 +58,7 @@ class RememberTarget(gym.Env):
         draw_square(rgb, self.point, WHITE)
         if self.t < 4:
             draw_square(rgb, self.target, GREEN)
-        success = float(np.linalg.norm(self.point - self.target) < 0.2)
+        success = float(np.linalg.norm(self.point - self.target) < 0.2)  # np.bool_ would become an array of objects
         state = np.concatenate([self.target, self.point])
         return {"rgb": rgb, "joints": self.point}, {"success": success, "state": state, "cue": self.target.copy()}
 
@@ -67,7 +67,7 @@ gym.register(TASK, RememberTarget, max_episode_steps=20)
 
 
 def make_envs(args: object) -> gym.vector.VectorEnv:
-    """In place of the scripts' make_envs. For a slow simulator: "async", and args.num_workers environments."""
+    """In place of the scripts' make_envs. For a slow simulator: "async", with fewer."""
     return gym.make_vec(TASK, args.num_envs, "sync", vector_kwargs={"autoreset_mode": "Disabled"})
 
 

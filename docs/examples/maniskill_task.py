@@ -36,8 +36,8 @@ class RememberDisc(PushCubeEnv):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
         pose = self.goal_region.pose.raw_pose.clone()
-        low, high = torch.tensor([[0.0, -0.2], [0.2, 0.2]], device=self.device)
-        pose[:, :2] = low + (high - low) * torch.rand(len(env_idx), 2, device=self.device)
+        place = self._batched_episode_rng[env_idx].uniform([0.0, -0.2], [0.2, 0.2])
+        pose[:, :2] = torch.as_tensor(place, dtype=torch.float32, device=self.device)
         self.goal_region.set_pose(Pose.create(pose))
         self.oracle_info = pose[:, :2]  # the memory variable (B, 2), which becomes info["cue"]
 
