@@ -28,6 +28,7 @@ RESULTS = ROOT / "benchmark" / "results"
 KEY = ["task", "method", "setting", "seed", "step"]
 METRICS = ["success_once", "success_at_end", "return", "u_r2", "u_r2_at_end"]
 METHODS = {"ppo_aib": "AIB", "ppo_believer": "Believer", "ppo_baseline": "PPO"}
+ORACLES = {"true_state": "oracle state", "true_u": "oracle u", "true_target": "oracle target"}
 HEADS = {"flow": "AIB", "mse": "AIB, MSE head", "none": "AIB, no head", None: "Believer"}  # action_head in args.json
 COLOURS = {"AIB": "tab:red", "Believer": "tab:blue", "PPO": "tab:green"}
 COLOURS |= {"AIB, MSE head": "tab:orange", "AIB, no head": "tab:purple"}
@@ -94,10 +95,10 @@ def eval_rows(folder: Path, setting: str) -> list[dict]:
     rows = []
     for file in sorted(folder.glob("*__*__*/eval.csv")):
         args = json.loads((file.parent / "args.json").read_text())
-        script = re.match("[a-z]+_[a-z]+", args["exp_name"])[0]
-        if args["quick"] or script not in METHODS:
+        method = (METHODS | ORACLES).get(re.match("[a-z]+_[a-z]+", args["exp_name"])[0])
+        if args["quick"] or method is None:
             continue
-        run = {"task": args["env_id"], "method": METHODS[script], "seed": args["seed"]}
+        run = {"task": args["env_id"], "method": method, "seed": args["seed"]}
         run["setting"] = setting or args["exp_name"]
         for row in csv.DictReader(file.open()):
             metrics = {name: f"{float(row[name]):.4f}" for name in METRICS if name in row}
