@@ -44,8 +44,8 @@ def linear_fit(x: np.ndarray, y: np.ndarray, train: int) -> np.ndarray:
 
 
 def target_position(state: np.ndarray, cue_dim: int) -> np.ndarray:
-    """Target position (N, 2) in metres: the state is the cue and a position per object, zeros but for the target's."""
-    return state[:, cue_dim:].reshape(len(state), -1, 3).sum(1)[:, :2]
+    """Target position (N, 3) in metres: the state is the cue and a position per object, zeros but for the target's."""
+    return state[:, cue_dim:].reshape(len(state), -1, 3).sum(1)
 
 
 def describe(state: np.ndarray, cue: np.ndarray, u: np.ndarray, train: int) -> dict[str, float]:
@@ -59,7 +59,7 @@ def describe(state: np.ndarray, cue: np.ndarray, u: np.ndarray, train: int) -> d
     report = {"variance": u.var(0).sum()}
     for name, x in (("target", target), ("cue", one_hot), ("target_x_cue", products)):
         report[f"share_{name}"] = 1 - np.square(linear_fit(x, u, train)).sum() / total
-    report["target_error_cm"] = 100 * np.sqrt(np.square(linear_fit(u, target, train)).sum(1).mean())
+    report["target_error_cm"] = 100 * np.sqrt(np.square(linear_fit(u, target[:, :2], train)).sum(1).mean())
     return report
 
 
@@ -97,11 +97,11 @@ def main(args: Args) -> None:
     table = slice(20, None)  # the objects stand on the table
     with torch.no_grad():
         u = phi(torch.from_numpy(states[:, table])).mean.flatten(0, 1).numpy()
-    target = target_position(states[:, table].reshape(len(u), -1), cue.shape[1])
+    target = target_position(states[:, table].reshape(len(u), -1), cue.shape[1])[:, :2]
     probe = RidgeCV(np.logspace(-4, 3, 15)).fit(u, target)
     buffer = play(args.agent)
     for t in (12, 20, 40, -1):
-        target = target_position(buffer["state"][t].cpu().numpy(), cue.shape[1])
+        target = target_position(buffer["state"][t].cpu().numpy(), cue.shape[1])[:, :2]
         particle = buffer["particles"][t].mean(-2).cpu().numpy()
         tool = buffer["joints"][t, :, 18:20].cpu().numpy()
         for name, x in (("particle_error_cm", probe.predict(particle)), ("tool_distance_cm", tool)):
