@@ -37,7 +37,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 6  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
@@ -67,9 +67,9 @@ class Args:
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
+    """at most so many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results differ by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results change by rounding"""
     small: bool = False
     """smaller than the paper, for a CPU and an hour or two; tuned on RememberColor3-v0"""
     quick: bool = False
@@ -115,7 +115,7 @@ class Args:
     """updates between checkpoints, each with a validation"""
 
 
-# what an argument may be; elsewhere whole numbers from 1 and others from 0
+# (lowest, highest) of an argument; of others: whole numbers at least 1, fractions at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_shift=(0, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
@@ -233,7 +233,7 @@ def chrono_init(gru: nn.GRU, steps: int) -> None:
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h), all that acting needs (paper 3.2).
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h); phi, to measure them (paper 3.2).
 
     config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
@@ -244,10 +244,10 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # says what u is; only evaluations need it
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # for evaluations
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
-        """Give p(u|z_i,h) of z_i ~ p(z|h), i = 1..n: h (..., 256), noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
+        """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
         p = self.prior(h)
         z = p.mean.unsqueeze(-2) + p.stddev.unsqueeze(-2) * z_noise
         return self.decoder(torch.cat([z, h.unsqueeze(-2).expand(*z.shape[:-1], -1)], -1))
@@ -595,7 +595,7 @@ def open_run(path: Path, args: Args) -> None:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     if args.overwrite:

@@ -45,7 +45,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 6  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -74,9 +74,9 @@ class Args:
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
+    """at most so many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results differ by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results change by rounding"""
     small: bool = False
     """smaller than the paper, for a CPU and an hour or two; tuned on RememberColor3-v0"""
     quick: bool = False
@@ -118,7 +118,7 @@ class Args:
     """image network in bfloat16"""
 
 
-# what an argument may be; elsewhere whole numbers from 1 and others from 0
+# (lowest, highest) of an argument; of others: whole numbers at least 1, fractions at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), val_fraction=(0, 1), noise_beta=(0, 2))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
@@ -423,24 +423,24 @@ def main(args: Args) -> None:
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
-    """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
+    """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and what else the task hides.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
     """
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
         self.task, self.poses, task_evaluate = env.unwrapped, {}, env.unwrapped.evaluate
 
-        def evaluate() -> dict:
+        def evaluate_and_note_poses() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        # evaluate hides objects by moving them to z = 1000; the picture is taken, and _view moves them back. On the GPU
-        # simulator the next physics step does that by itself.
+        # A task's evaluate hides objects at z = 1000; _view takes the picture and moves them back. On the GPU simulator
+        # the next physics step moves them back by itself.
         if not self.task.gpu_sim_enabled:
-            self.task.evaluate = evaluate
+            self.task.evaluate = evaluate_and_note_poses
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
@@ -522,7 +522,7 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
-    """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
+    """Build one ManiSkill environment: on physx_cuda tensors of num_scenes, on physx_cpu numpy arrays of one scene."""
     if multiprocessing.parent_process():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
     with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
@@ -549,11 +549,11 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
     Actions lie in [-1, 1]: changes of the arm's 7 joint angles, and the gripper's opening.
     physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
-    forked from one that has imported the tasks, except where there is CUDA, which forbids it.
+    forked from one that has imported the tasks, or spawned beside CUDA, which does not survive a fork.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
@@ -634,7 +634,7 @@ def open_run(path: Path, args: Args) -> None:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     if args.overwrite:

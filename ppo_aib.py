@@ -6,7 +6,8 @@ turns them into a vector that joins image and joints as the input of actor and c
 Usage:   python ppo_aib.py --env-id InterceptFast-v0
          python ppo_aib.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_aib__1/agent.pt
 Reads:   runs/{env_id}__aib_belief__{seed}/belief.pt; where it is missing, aib_belief.py runs first
-Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events
+Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events; args.json and
+         checkpoint.pt to resume
 """
 
 import ctypes
@@ -51,7 +52,7 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 6  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
@@ -81,9 +82,9 @@ class Args:
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
+    """at most so many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results differ by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results change by rounding"""
     small: bool = False
     """smaller than the paper, for a CPU and an hour or two; tuned on RememberColor3-v0"""
     quick: bool = False
@@ -102,7 +103,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training"""
     num_envs: int = 256
-    """episodes per iteration; on physx_cuda all of them start from one arm pose"""
+    """episodes per iteration; on physx_cuda one arm pose is drawn for all of them"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
     update_epochs: int = 2
@@ -132,18 +133,18 @@ class Args:
     noise_beta: float = 0.0
     """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, the paper's; 1 is pink"""
     amp: bool = False
-    """image network in bfloat16"""
+    """image networks of policy and belief in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint, with the task, robot, sizes and precision that it was trained with"""
+    """only evaluate --checkpoint, with the env_id, robot, num_envs and precision that are stored in it"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
 
-# what an argument may be; elsewhere whole numbers from 1 and others from 0
+# (lowest, highest) of an argument; of others: whole numbers at least 1, fractions at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
 LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "evaluate", "checkpoint")  # when a run is resumed
-TASKS = {  # Table 5, where it differs from the defaults above, which are InterceptFast's and InterceptMedium's
+TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
@@ -253,7 +254,7 @@ class HistoryEncoder(nn.Module):
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h), all that acting needs (paper 3.2).
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h); phi, to measure them (paper 3.2).
 
     config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
@@ -264,10 +265,10 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # says what u is; only evaluations need it
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # for evaluations
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
-        """Give p(u|z_i,h) of z_i ~ p(z|h), i = 1..n: h (..., 256), noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
+        """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
         p = self.prior(h)
         z = p.mean.unsqueeze(-2) + p.stddev.unsqueeze(-2) * z_noise
         return self.decoder(torch.cat([z, h.unsqueeze(-2).expand(*z.shape[:-1], -1)], -1))
@@ -293,7 +294,7 @@ class Agent(nn.Module):
         """Distribution of actions (B, A), value (B,): rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u)."""
         belief = self.w_agg(self.w_enc(obs["particles"]).mean(-2))
         x = torch.cat([self.cnn(obs["rgb"].float().div_(255)), self.joints(obs["joints"]), belief], -1)
-        mean = torch.tanh(self.actor(x))
+        mean = torch.tanh(self.actor(x))  # within the box of actions
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
 
 
@@ -349,15 +350,16 @@ def rollout(
     Returns arrays (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; and values (T+1, N),
     V(o_T) last; if deterministic also the privileged state, which the evaluation compares the belief with.
     The particles are kept because fresh ones would change the probability ratio of the update. Episodes are played in
-    rounds of envs.num_envs; all noise is drawn before, so that their size does not matter.
+    rounds of envs.num_envs scenes, fewer than args.num_envs on physx_cpu; all noise is drawn before the first round, so
+    that the size of a round does not matter there. info: see PrivilegedInfoWrapper.
     """
     num_episodes, steps, device = len(seeds), gym.spec(args.env_id).max_episode_steps, torch.device(args.device)
     (action_dim,) = envs.single_action_space.shape
     noise = colored_noise(args.noise_beta, (num_episodes, action_dim, steps), np.random.default_rng(seeds))
     noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
-    particles, config = (steps + 1, num_episodes, args.num_particles), agent.belief.config
-    z_noise = torch.randn(*particles, config["z_dim"], device=device)
-    u_noise = torch.randn(*particles, config["u_dim"], device=device)
+    shape, config = (steps + 1, num_episodes, args.num_particles), agent.belief.config
+    z_noise = torch.randn(*shape, config["z_dim"], device=device)
+    u_noise = torch.randn(*shape, config["u_dim"], device=device)
     if not args.sample_decoder:
         u_noise.zero_()
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
@@ -365,16 +367,17 @@ def rollout(
     name = "evaluation" if deterministic else "rollout"
     bar = tqdm(total=len(rounds) * steps, desc=name, unit="step", unit_scale=envs.num_envs, leave=False)
     for first in rounds:
-        rows = np.arange(first, first + envs.num_envs) % num_episodes  # the last round is filled up with repetitions,
-        new = rows[: num_episodes - first]  # which are not kept
+        # the last round is filled up with repetitions; only the new ones are kept
+        rows = np.arange(first, first + envs.num_envs) % num_episodes
+        new = rows[: num_episodes - first]
         obs, info = envs.reset(seed=seeds[rows].tolist())
         hidden = None
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
             x = agent.belief.history.embed(step["rgb"], step["joints"])
             h, hidden = agent.belief.history(x[None], hidden)
-            u = agent.belief.decode(h[0], z_noise[t, rows])
-            step["particles"] = u.mean + u.stddev * u_noise[t, rows]
+            p_u = agent.belief.decode(h[0], z_noise[t, rows])
+            step["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
             dist, values = agent(step)
             buffer["values"][t, new] = values[: len(new)]
             if t == steps:
@@ -428,7 +431,7 @@ def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args) -> tuple[dict
     u_r2, u_r2_at_end: what the belief knows where its agent takes it, R2 of u = phi(s) from the mean particle, over all
     steps and at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
     """
-    torch.manual_seed(0)
+    torch.manual_seed(0)  # main seeds each iteration anew
     buffer = rollout(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), deterministic=True)
     u, estimate = agent.belief.phi(buffer["state"]).mean, buffer["particles"].mean(-2)
     metrics = success_and_return(buffer)
@@ -489,15 +492,15 @@ def main(args: Args) -> None:
     agent = Agent(envs, AIBBelief(stored["config"], args.amp), args).to(device)
     agent.belief.load_state_dict(stored["belief"])
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
+    done, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        print(f"resuming {path} at step {first * per_iteration:,}", flush=True)
-    writer = SummaryWriter(path, purge_step=first * per_iteration + 1)
-    bar = tqdm(total=num_iterations * per_iteration, initial=first * per_iteration, desc="PPO", unit="step")
+        print(f"resuming {path} at step {done * per_iteration:,}", flush=True)
+    writer = SummaryWriter(path, purge_step=done * per_iteration + 1)
+    bar = tqdm(total=num_iterations * per_iteration, initial=done * per_iteration, desc="PPO", unit="step")
 
-    for iteration in range(first + 1, num_iterations + 1):
+    for iteration in range(done + 1, num_iterations + 1):
         start, global_step = time.time(), iteration * per_iteration
         torch.manual_seed(args.seed * 1_000_000 + iteration)  # so that a resumed run repeats the iteration
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
@@ -525,7 +528,7 @@ def main(args: Args) -> None:
                 break
         for name in losses:
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in stepped or [losses]]).mean().item()
-        explained = 1 - batch["advantages"].var() / batch["returns"].var()
+        explained = 1 - batch["advantages"].var() / batch["returns"].var()  # advantages are returns - values
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(stepped)}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
@@ -534,9 +537,9 @@ def main(args: Args) -> None:
         if iteration % args.eval_every == 0 or iteration == num_iterations:
             metrics, video = evaluate(envs, agent, args)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
-            rows.append({"iteration": iteration, "global_step": global_step, **metrics})
-            lines = [",".join(rows[0])]
-            for row in rows:
+            evals.append({"iteration": iteration, "global_step": global_step, **metrics})
+            lines = [",".join(evals[0])]
+            for row in evals:
                 lines.append(",".join(map(str, row.values())))
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
@@ -548,12 +551,12 @@ def main(args: Args) -> None:
             writer.add_scalar(name, value, global_step)
         writer.flush()
         states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()}
-        save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": rows, **states})
+        save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": evals, **states})
         bar.update(per_iteration)
     bar.close()
     envs.close()
     for name in ("success_once", "success_at_end", "return"):
-        values = [row[name] for row in rows]
+        values = [row[name] for row in evals]
         print(f"{name}: mean of the last three evaluations {np.mean(values[-3:]):.3f}, maximum {max(values):.3f}")
 
 
@@ -561,24 +564,24 @@ def main(args: Args) -> None:
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
-    """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
+    """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and what else the task hides.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
     """
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
         self.task, self.poses, task_evaluate = env.unwrapped, {}, env.unwrapped.evaluate
 
-        def evaluate() -> dict:
+        def evaluate_and_note_poses() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        # evaluate hides objects by moving them to z = 1000; the picture is taken, and _view moves them back. On the GPU
-        # simulator the next physics step does that by itself.
+        # A task's evaluate hides objects at z = 1000; _view takes the picture and moves them back. On the GPU simulator
+        # the next physics step moves them back by itself.
         if not self.task.gpu_sim_enabled:
-            self.task.evaluate = evaluate
+            self.task.evaluate = evaluate_and_note_poses
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
@@ -660,7 +663,7 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
-    """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
+    """Build one ManiSkill environment: on physx_cuda tensors of num_scenes, on physx_cpu numpy arrays of one scene."""
     if multiprocessing.parent_process():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
     with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
@@ -687,11 +690,11 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
     Actions lie in [-1, 1]: changes of the arm's 7 joint angles, and the gripper's opening.
     physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
-    forked from one that has imported the tasks, except where there is CUDA, which forbids it.
+    forked from one that has imported the tasks, or spawned beside CUDA, which does not survive a fork.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
@@ -772,7 +775,7 @@ def open_run(path: Path, args: Args) -> None:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     if args.overwrite:

@@ -2,7 +2,8 @@
 
 Usage:   python ppo_baseline.py --env-id InterceptFast-v0
          python ppo_baseline.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_baseline__1/agent.pt
-Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events
+Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events; args.json and
+         checkpoint.pt to resume
 """
 
 import ctypes
@@ -44,7 +45,7 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 6  # of every .pt file and of dataset/: raised when older scripts would misread newer files
+FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
@@ -74,9 +75,9 @@ class Args:
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """per mesh of the robot; with 500, 1 % of pixels change and a CPU steps 10 times as fast; 0: meshes untouched"""
+    """at most so many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results differ by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results change by rounding"""
     small: bool = False
     """smaller than the paper, for a CPU and an hour or two; tuned on RememberColor3-v0"""
     quick: bool = False
@@ -87,7 +88,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training"""
     num_envs: int = 256
-    """episodes per iteration; on physx_cuda all of them start from one arm pose"""
+    """episodes per iteration; on physx_cuda one arm pose is drawn for all of them"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
     update_epochs: int = 2
@@ -119,16 +120,16 @@ class Args:
     amp: bool = False
     """image network in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint, with the task, robot, sizes and precision that it was trained with"""
+    """only evaluate --checkpoint, with the env_id, robot, num_envs and precision that are stored in it"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
 
-# what an argument may be; elsewhere whole numbers from 1 and others from 0
+# (lowest, highest) of an argument; of others: whole numbers at least 1, fractions at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
 LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "evaluate", "checkpoint")  # when a run is resumed
-TASKS = {  # Table 5, where it differs from the defaults above, which are InterceptFast's and InterceptMedium's
+TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
@@ -189,7 +190,7 @@ class Agent(nn.Module):
     def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
         """Distribution of actions (B, A), value (B,): rgb (B, H, W, 3) uint8 and joints (B, J)."""
         x = torch.cat([self.cnn(obs["rgb"].float().div_(255)), self.joints(obs["joints"])], -1)
-        mean = torch.tanh(self.actor(x))
+        mean = torch.tanh(self.actor(x))  # within the box of actions
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
 
 
@@ -254,8 +255,9 @@ def rollout(
     name = "evaluation" if deterministic else "rollout"
     bar = tqdm(total=len(rounds) * steps, desc=name, unit="step", unit_scale=envs.num_envs, leave=False)
     for first in rounds:
-        rows = np.arange(first, first + envs.num_envs) % num_episodes  # the last round is filled up with repetitions,
-        new = rows[: num_episodes - first]  # which are not kept
+        # the last round is filled up with repetitions; only the new ones are kept
+        rows = np.arange(first, first + envs.num_envs) % num_episodes
+        new = rows[: num_episodes - first]
         obs, info = envs.reset(seed=seeds[rows].tolist())
         for t in range(steps + 1):
             step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
@@ -300,7 +302,7 @@ def make_video(buffer: dict[str, Tensor]) -> bytes:
 
 def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time."""
-    torch.manual_seed(0)
+    torch.manual_seed(0)  # main seeds each iteration anew
     buffer = rollout(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), deterministic=True)
     return success_and_return(buffer), make_video(buffer)
 
@@ -346,15 +348,15 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     agent = Agent(envs, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    first, rows = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
+    done, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        print(f"resuming {path} at step {first * per_iteration:,}", flush=True)
-    writer = SummaryWriter(path, purge_step=first * per_iteration + 1)
-    bar = tqdm(total=num_iterations * per_iteration, initial=first * per_iteration, desc="PPO", unit="step")
+        print(f"resuming {path} at step {done * per_iteration:,}", flush=True)
+    writer = SummaryWriter(path, purge_step=done * per_iteration + 1)
+    bar = tqdm(total=num_iterations * per_iteration, initial=done * per_iteration, desc="PPO", unit="step")
 
-    for iteration in range(first + 1, num_iterations + 1):
+    for iteration in range(done + 1, num_iterations + 1):
         start, global_step = time.time(), iteration * per_iteration
         torch.manual_seed(args.seed * 1_000_000 + iteration)  # so that a resumed run repeats the iteration
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
@@ -382,7 +384,7 @@ def main(args: Args) -> None:
                 break
         for name in losses:
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in stepped or [losses]]).mean().item()
-        explained = 1 - batch["advantages"].var() / batch["returns"].var()
+        explained = 1 - batch["advantages"].var() / batch["returns"].var()  # advantages are returns - values
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(stepped)}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
@@ -391,9 +393,9 @@ def main(args: Args) -> None:
         if iteration % args.eval_every == 0 or iteration == num_iterations:
             metrics, video = evaluate(envs, agent, args)
             scalars |= {f"eval/{name}": value for name, value in metrics.items()}
-            rows.append({"iteration": iteration, "global_step": global_step, **metrics})
-            lines = [",".join(rows[0])]
-            for row in rows:
+            evals.append({"iteration": iteration, "global_step": global_step, **metrics})
+            lines = [",".join(evals[0])]
+            for row in evals:
                 lines.append(",".join(map(str, row.values())))
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
@@ -405,12 +407,12 @@ def main(args: Args) -> None:
             writer.add_scalar(name, value, global_step)
         writer.flush()
         states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()}
-        save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": rows, **states})
+        save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": evals, **states})
         bar.update(per_iteration)
     bar.close()
     envs.close()
     for name in ("success_once", "success_at_end", "return"):
-        values = [row[name] for row in rows]
+        values = [row[name] for row in evals]
         print(f"{name}: mean of the last three evaluations {np.mean(values[-3:]):.3f}, maximum {max(values):.3f}")
 
 
@@ -418,24 +420,24 @@ def main(args: Args) -> None:
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
-    """Split what a task in obs_mode state_dict shows from what only the simulator knows, for a batch of B scenes.
+    """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), it and what else the task hides.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
     """
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
         self.task, self.poses, task_evaluate = env.unwrapped, {}, env.unwrapped.evaluate
 
-        def evaluate() -> dict:
+        def evaluate_and_note_poses() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        # evaluate hides objects by moving them to z = 1000; the picture is taken, and _view moves them back. On the GPU
-        # simulator the next physics step does that by itself.
+        # A task's evaluate hides objects at z = 1000; _view takes the picture and moves them back. On the GPU simulator
+        # the next physics step moves them back by itself.
         if not self.task.gpu_sim_enabled:
-            self.task.evaluate = evaluate
+            self.task.evaluate = evaluate_and_note_poses
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
@@ -517,7 +519,7 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
-    """Build one ManiSkill environment of num_scenes; on physx_cpu that is one, and arrays are numpy without batch."""
+    """Build one ManiSkill environment: on physx_cuda tensors of num_scenes, on physx_cpu numpy arrays of one scene."""
     if multiprocessing.parent_process():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
     with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
@@ -544,11 +546,11 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
     Actions lie in [-1, 1]: changes of the arm's 7 joint angles, and the gripper's opening.
     physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
-    forked from one that has imported the tasks, except where there is CUDA, which forbids it.
+    forked from one that has imported the tasks, or spawned beside CUDA, which does not survive a fork.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers: a process per core
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
@@ -629,7 +631,7 @@ def open_run(path: Path, args: Args) -> None:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     if args.overwrite:

@@ -16,9 +16,9 @@ OWN = ("Args", "main", "evaluate_checkpoint", "SMALL", "QUICK", "LIMITS", "MAY_D
 BUDGET = {  # a reader's: tokens of code, lines
     "aib_repr": (5972, 678),
     "aib_belief": (5914, 660),
-    "ppo_aib": (7340, 841),
-    "ppo_believer": (9336, 1033),
-    "ppo_baseline": (5818, 677),
+    "ppo_aib": (7340, 844),
+    "ppo_believer": (9336, 1036),
+    "ppo_baseline": (5818, 679),
 }
 
 
