@@ -90,6 +90,9 @@ def main(args: Args) -> None:
     source = Path(args.repr_dir.format(**vars(settings)))
     task = {name: stored[name] for name in ("env_id", "robot", "robot_triangles")}
     encoder = load(source / "repr.pt", "name its run of aib_repr.py with --repr-dir", kind="repr", **task)
+    if encoder["sim_backend"] == "physx_cuda":
+        fail(f"{source} is of physx_cuda, which draws scenes by batch; only episodes of physx_cpu can be played again")
+    settings.sim_backend = "physx_cpu"
     if "refreshed_by" in encoder:
         fail(f"{source} is a refreshed dataset; name the run of aib_repr.py that it was made from with --repr-dir")
     path = Path("runs") / f"{settings.env_id}__{args.exp_name}__{settings.seed}"
