@@ -109,6 +109,7 @@ def refresh(quick_runs: Path, script: str, source: str = "aib_repr_quick") -> tu
     return run("benchmark/refresh", *options, cwd=quick_runs.parent)
 
 
+@pytest.mark.thorough
 def test_refresh_adds_episodes_of_the_agent(quick_runs: Path) -> None:
     """The same scenes, other actions, the same phi; stage 2 trains on it, and nothing that exists is overwritten."""
     code, out, err = refresh(quick_runs, "ppo_aib")
