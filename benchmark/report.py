@@ -303,13 +303,18 @@ def learning_curves(evals: list[dict], path: Path) -> None:
     for task, setting in RESULTS_ROWS:
         if by_seed(evals, "success_once", task=task, setting=setting):
             panels.append((task, setting))
-    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 3.2), layout="constrained", sharey=True)
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(4 * len(panels), 3.4), layout="constrained", sharex=True, sharey=True
+    )
     for ax, (task, setting) in zip(axes, panels, strict=True):
+        seeds = []
         for method in METHODS.values():
             curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
             draw(ax, curves, method, COLOURS[method])
+            seeds.append(f"{method} {len(curves)}")
         ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
-        ax.set(title=f"{task.removesuffix('-v0')}, {setting}", xlabel="environment steps", ylim=(0, 1.02))
+        ax.set_title(f"{task.removesuffix('-v0')}, {setting}\nseeds: {', '.join(seeds)}", fontsize=10)
+        ax.set(xlabel="environment steps", ylim=(0, 1.02))
     axes[0].set_ylabel("success_once")
     save_figure(figure, axes, path)
 
