@@ -42,9 +42,6 @@ CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations t
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
-# glibc keeps freed memory for the next update instead of returning it, which makes large tensors cheaper on a CPU
-ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
-ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
 # ---------------------------------------------------------------- arguments

@@ -7,7 +7,6 @@ Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events
 """
 
-import ctypes
 import difflib
 import fcntl
 import json
@@ -49,9 +48,6 @@ FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
-# glibc keeps freed memory for the next update instead of returning it, which makes large tensors cheaper on a CPU
-ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
-ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
 # ---------------------------------------------------------------- arguments

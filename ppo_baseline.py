@@ -6,7 +6,6 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, Tensor
          checkpoint.pt to resume
 """
 
-import ctypes
 import difflib
 import fcntl
 import json
@@ -50,9 +49,6 @@ CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
 EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
-# glibc keeps freed memory for the next update instead of returning it, which makes large tensors cheaper on a CPU
-ctypes.CDLL(None).mallopt(-4, 0)  # M_MMAP_MAX
-ctypes.CDLL(None).mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
 
 
 # ---------------------------------------------------------------- arguments
