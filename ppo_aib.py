@@ -55,7 +55,8 @@ from tqdm import tqdm
 FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
-EVAL_SEED = 2**30 + 2**29  # first seed of the evaluation episodes; training seeds lie below 2**30
+EVAL_SEED = 2**30 + 2**29  # first seed of the evaluations while training, whose seeds lie below 2**30
+TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, whose episodes no choice has seen
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -124,7 +125,7 @@ class Args:
     eval_every: int = 25
     """iterations between evaluations"""
     num_eval_episodes: int = 192
-    """episodes per evaluation, the same every time"""
+    """episodes per evaluation, the same every time; those of --evaluate are others"""
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
     noise_beta: float = 0.0
@@ -422,14 +423,16 @@ def r_squared(u: Tensor, estimate: Tensor) -> float:
 
 
 @torch.no_grad()
-def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args) -> tuple[dict[str, float], bytes]:
+def evaluate(
+    envs: gym.vector.VectorEnv, agent: Agent, args: Args, first_seed: int = EVAL_SEED
+) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
     u_r2, u_r2_at_end: what the belief knows where its agent takes it, R2 of u = phi(s) from the mean particle, over all
     steps and at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
     """
     torch.manual_seed(0)  # main seeds each iteration anew
-    buffer = rollout(envs, agent, args, EVAL_SEED + np.arange(args.num_eval_episodes), deterministic=True)
+    buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
     u, estimate = agent.belief.phi(buffer["state"]).mean, buffer["particles"].mean(-2)
     metrics = success_and_return(buffer)
     metrics["u_r2"] = r_squared(u.flatten(0, 1), estimate.flatten(0, 1))
@@ -441,7 +444,7 @@ def evaluate(envs: gym.vector.VectorEnv, agent: Agent, args: Args) -> tuple[dict
 
 
 def evaluate_checkpoint(args: Args) -> None:
-    """Evaluate the agent of --checkpoint, on the task it was trained on; writes evaluation.json and .mp4 beside it."""
+    """Evaluate the agent of --checkpoint, on test episodes; writes evaluation.json and .mp4 beside it."""
     file = Path(args.checkpoint.format(**vars(args)))
     stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
     for name in ("env_id", "robot", "robot_triangles", "num_envs", "amp", "num_particles", "sample_decoder"):
@@ -450,7 +453,7 @@ def evaluate_checkpoint(args: Args) -> None:
     envs, device = make_envs(args), torch.device(args.device)
     agent = Agent(envs, AIBBelief(stored["config"], args.amp), args).to(device)
     agent.load_state_dict(stored["agent"])
-    metrics, video = evaluate(envs, agent, args)
+    metrics, video = evaluate(envs, agent, args, TEST_SEED)
     save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
     save(file.with_name("evaluation.mp4"), video)
     print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))

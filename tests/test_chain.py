@@ -91,15 +91,16 @@ def test_a_finished_run_is_left_as_it_is(quick_runs: Path) -> None:
     assert before == {file: file.stat().st_mtime_ns for file in path.rglob("*.pt")}
 
 
-def test_evaluate_alone_repeats_the_last_evaluation(quick_runs: Path) -> None:
+def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Path) -> None:
     path = quick_runs / f"{TASK}__ppo_aib_quick__1"
     options = ["--checkpoint", str(path / "agent.pt"), "--num-eval-episodes", "2"]
     code, out, err = run("ppo_aib", "--evaluate", *options, cwd=quick_runs.parent)
     assert code == 0, err
     metrics = json.loads((path / "evaluation.json").read_text())
     last = list(csv.DictReader((path / "eval.csv").open()))[-1]
-    for name in ("success_once", "success_at_end", "return"):
-        assert metrics[name] == pytest.approx(float(last[name]), rel=1e-4)
+    assert metrics.keys() == last.keys() - {"iteration", "global_step"}
+    assert metrics["return"] != pytest.approx(float(last["return"]), rel=1e-3), "test episodes, not those of training"
+    assert f"return {metrics['return']:.3f}" in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
 def refresh(quick_runs: Path, script: str, source: str = "aib_repr_quick") -> tuple[int, str, str]:

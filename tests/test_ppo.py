@@ -321,8 +321,11 @@ def test_evaluate_takes_over_what_the_episodes_depend_on(toy_task: Path, monkeyp
     seen = []
     monkeypatch.setattr(ppo_baseline, "make_envs", lambda args: seen.append(args) or toy.make_envs(args))
     options = dict(evaluate=True, checkpoint=str(agent), num_eval_episodes=4, num_workers=2)
+    seeds, rollout = [], ppo_baseline.rollout
+    monkeypatch.setattr(ppo_baseline, "rollout", lambda *args, **how: seeds.extend(args[3]) or rollout(*args, **how))
     ppo_baseline.evaluate_checkpoint(ppo_baseline.Args(num_envs=3, amp=True, **options))
     assert (seen[0].env_id, seen[0].num_envs, seen[0].amp) == (TOY, SMALL["num_envs"], False)
+    assert seeds == [ppo_baseline.EVAL_SEED + 2**20 + i for i in range(4)], "no episode of any training's evaluations"
 
 
 def test_orthogonal_initialisation() -> None:
