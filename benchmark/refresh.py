@@ -48,6 +48,12 @@ class Args:
     """simulator processes on physx_cpu"""
 
 
+def rows_of(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Scene of each row of a refreshed dataset of count scenes, held-out ones last; and whether the agent played it."""
+    scenes = np.sort(np.concatenate([np.arange(count), np.arange(1, count, 2)]))
+    return scenes, np.diff(scenes, prepend=-1) == 0  # a scene's second episode
+
+
 @torch.no_grad()
 def play(
     envs: gym.vector.VectorEnv, agent: Agent, settings: ppo_aib.Args, seeds: np.ndarray
@@ -111,8 +117,7 @@ def main(args: Args) -> None:
     phi.load_state_dict(encoder["phi"])
 
     count, part = encoder["num_episodes"], path.with_name(path.name + ".part")
-    scenes = np.sort(np.concatenate([np.arange(count), np.arange(1, count, 2)]))  # held-out scenes stay last
-    by_agent = np.diff(scenes, prepend=-1) == 0  # a scene's second episode
+    scenes, by_agent = rows_of(count)
     rows = np.flatnonzero(by_agent)
     encoder |= {"num_episodes": len(scenes), "num_val": int((scenes >= count - encoder["num_val"]).sum())}
     shutil.rmtree(part, ignore_errors=True)

@@ -257,6 +257,18 @@ def shift_table(evals: list[dict]) -> str:
     return markdown(["task", "method", "setting", "seed", *["steps", "success_once", "R² of u"] * 3], rows)
 
 
+def known_table(beliefs: list[dict]) -> str:
+    """R² of u and error of the target position at the last step, on held-out random episodes and on an agent's."""
+    rows = []
+    for task, setting in sorted({(row["task"], row["setting"]) for row in beliefs if row["metric"] == "u_r2_agent"}):
+        cells = []
+        for metric in ("u_r2_random", "error_cm_random", "u_r2_agent", "error_cm_agent"):
+            cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
+        rows.append([task.removesuffix("-v0"), setting, *cells])
+    head = ["task", "belief", "R² of u, random", "error, cm", "R² of u, agent", "error, cm"]
+    return markdown(head, rows)
+
+
 def phi_table(beliefs: list[dict]) -> str:
     """How much of u's variance at the last step is linear in the target position, the cue, and their products."""
     rows = []
@@ -353,7 +365,7 @@ def rebuild(output: Path) -> None:
     evals, beliefs = read("eval.csv"), read("beliefs.csv")
     tables = {"results": results_table(evals), "agents": agents_table(evals), "beliefs": beliefs_table(beliefs)}
     tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "phi": phi_table(beliefs)}
-    tables["shift"] = shift_table(evals)
+    tables |= {"shift": shift_table(evals), "known": known_table(beliefs)}
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
     learning_curves(evals, output / "benchmark" / "results" / "learning_curves.png")

@@ -4,12 +4,13 @@ PPO finds a target position that u encodes in one way for all cues sooner than o
 Per time step: the variance of u, and the shares of it that are linear in the target position, in the cue, and in both
 and their products; then the error with which the position is a linear function of u.
 
-With --agent also what that agent's belief knows of the target position on the evaluation's episodes, read from the mean
-particle by the same linear function: its error, and the distance of the tool from the target.
+With --belief, on a dataset of refresh.py, instead what a belief knows on held-out scenes, played by the random policy
+and by the agent: R2 of u from its mean particle, and the median error of the target position as read from it by a
+linear function of u.
 
 Usage:   python benchmark/u_geometry.py --repr-dir runs/RememberColor5-v0__aib_repr_small__1
-         python benchmark/u_geometry.py --repr-dir runs/RememberColor3-v0__aib_repr_small__1 \
-             --agent runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
+         python benchmark/u_geometry.py --repr-dir runs/RememberColor3-v0__aib_repr_refreshed__1 \
+             --belief runs/RememberColor3-v0__aib_belief_small__1/belief.pt
 Prints:  rows of task, kl_coef, psi_images, epochs, episodes, step, metric, value
 """
 
@@ -23,8 +24,9 @@ import tyro
 from sklearn.linear_model import RidgeCV
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-import ppo_aib  # noqa: E402
-from aib_belief import StateEncoder  # noqa: E402
+from refresh import rows_of  # noqa: E402
+
+from aib_belief import AIBBelief, EpisodeDataset, GaussianMLP, StateEncoder, encode  # noqa: E402
 from ppo_aib import load  # noqa: E402
 
 
@@ -34,8 +36,8 @@ class Args:
     """run directory of stage 1"""
     steps: tuple[int, ...] = (3, 8, 60)
     """time steps: the cue is shown, nothing is shown, the objects stand on the table"""
-    agent: Path | None = None
-    """agent.pt of ppo_aib.py on the same u"""
+    belief: Path | None = None
+    """belief.pt of aib_belief.py, of any phi"""
 
 
 def linear_fit(x: np.ndarray, y: np.ndarray, train: int) -> np.ndarray:
@@ -63,20 +65,33 @@ def describe(state: np.ndarray, cue: np.ndarray, u: np.ndarray, train: int) -> d
     return report
 
 
-def play(file: Path) -> dict[str, torch.Tensor]:
-    """The evaluation's episodes with the agent of a file: ppo_aib.rollout's arrays."""
-    stored = load(file, "name an agent.pt of ppo_aib.py with --agent", kind="ppo_aib agent")
-    settings = ppo_aib.Args(env_id=stored["env_id"])
-    for name in ("robot", "robot_triangles", "num_envs", "amp", "num_particles", "num_eval_episodes"):
-        setattr(settings, name, stored[name])
-    envs = ppo_aib.make_envs(settings)
-    agent = ppo_aib.Agent(envs, ppo_aib.AIBBelief(stored["config"], settings.amp), settings).to(settings.device)
-    agent.load_state_dict(stored["agent"])
-    torch.manual_seed(0)
-    seeds = ppo_aib.EVAL_SEED + np.arange(settings.num_eval_episodes)
-    buffer = ppo_aib.rollout(envs, agent, settings, seeds, deterministic=True)
-    envs.close()
-    return buffer
+@torch.no_grad()
+def shift(args: Args, states: torch.Tensor, cue_dim: int, num_val: int) -> dict[tuple[int, str], float]:
+    """Metrics by time step of a belief on the held-out scenes of a refreshed dataset with states (N, T+1, D)."""
+    config = load(args.belief, "name a belief.pt of aib_belief.py with --belief", kind="aib_belief")["config"]
+    belief = AIBBelief(config)
+    belief.load_state_dict(load(args.belief, "")["belief"])
+    u = belief.phi(states).mean
+    target = torch.from_numpy(target_position(states.flatten(0, 1).numpy(), cue_dim)[:, :2]).unflatten(0, u.shape[:2])
+    _, by_agent = rows_of(len(states) * 2 // 3)
+    held_out = np.arange(len(states)) >= len(states) - num_val
+    table = slice(20, None)  # the objects stand on the table
+    train = np.flatnonzero(~held_out & ~by_agent)
+    probe = RidgeCV(np.logspace(-4, 3, 15)).fit(u[train, table].flatten(0, 1), target[train, table].flatten(0, 1))
+    episodes = EpisodeDataset(args.repr_dir / "dataset", u, torch.device("cpu"))
+    posterior = GaussianMLP(config["u_dim"] + 256, [256, 256], config["z_dim"], min_std=0.1)  # not looked at
+    report = {}
+    for name, rows in (
+        ("random", np.flatnonzero(held_out & ~by_agent)),
+        ("agent", np.flatnonzero(held_out & by_agent)),
+    ):
+        particle = encode(belief, posterior, episodes, rows)["particle"]
+        for t in (12, 20, 40, states.shape[1] - 1):
+            residual = (particle[:, t] - u[rows, t]).square().sum()
+            report[t, f"u_r2_{name}"] = 1 - (residual / (u[rows, t] - u[rows, t].mean(0)).square().sum()).item()
+            error = np.linalg.norm(probe.predict(particle[:, t]) - target[rows, t].numpy(), axis=1)
+            report[t, f"error_cm_{name}"] = 100 * np.median(error)
+    return report
 
 
 def main(args: Args) -> None:
@@ -84,28 +99,20 @@ def main(args: Args) -> None:
     stored = load(args.repr_dir / "repr.pt", "name a run of aib_repr.py with --repr-dir", kind="repr")
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
-    states = np.load(args.repr_dir / "dataset" / "state.npy")
+    states = torch.from_numpy(np.load(args.repr_dir / "dataset" / "state.npy"))
     cue = np.load(args.repr_dir / "dataset" / "cue.npy")
-    setting = [stored[name] for name in ("env_id", "kl_coef", "psi_images", "epochs", "num_episodes")]
-    for t in args.steps:
-        with torch.no_grad():
-            u = phi(torch.from_numpy(states[:, t])).mean.numpy()
-        for name, value in describe(states[:, t], cue, u, len(u) - stored["num_val"]).items():
-            print(*setting, t, name, f"{value:.3f}", sep=",")
-    if args.agent is None:
-        return
-    table = slice(20, None)  # the objects stand on the table
-    with torch.no_grad():
-        u = phi(torch.from_numpy(states[:, table])).mean.flatten(0, 1).numpy()
-    target = target_position(states[:, table].reshape(len(u), -1), cue.shape[1])[:, :2]
-    probe = RidgeCV(np.logspace(-4, 3, 15)).fit(u, target)
-    buffer = play(args.agent)
-    for t in (12, 20, 40, -1):
-        target = target_position(buffer["state"][t].cpu().numpy(), cue.shape[1])[:, :2]
-        particle = buffer["particles"][t].mean(-2).cpu().numpy()
-        tool = buffer["joints"][t, :, 18:20].cpu().numpy()
-        for name, x in (("particle_error_cm", probe.predict(particle)), ("tool_distance_cm", tool)):
-            print(*setting, t, name, f"{100 * np.median(np.linalg.norm(x - target, axis=1)):.2f}", sep=",")
+    report = {}
+    if args.belief:
+        report = shift(args, states, cue.shape[1], stored["num_val"])
+    else:
+        for t in args.steps:
+            with torch.no_grad():
+                u = phi(states[:, t]).mean.numpy()
+            for name, value in describe(states[:, t].numpy(), cue, u, len(u) - stored["num_val"]).items():
+                report[t, name] = value
+    for (t, name), value in report.items():
+        setting = [stored[name] for name in ("env_id", "kl_coef", "psi_images", "epochs", "num_episodes")]
+        print(*setting, t, name, f"{value:.3f}", sep=",")
 
 
 if __name__ == "__main__":
