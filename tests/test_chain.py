@@ -99,7 +99,7 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
     metrics = json.loads((path / "evaluation.json").read_text())
     last = list(csv.DictReader((path / "eval.csv").open()))[-1]
     assert metrics.keys() == last.keys() - {"iteration", "global_step"}
-    assert metrics["return"] != pytest.approx(float(last["return"]), rel=1e-3), "test episodes, not those of training"
+    assert metrics["return"] != pytest.approx(float(last["return"]), rel=1e-5), "test episodes, not those of training"
     assert f"return {metrics['return']:.3f}" in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
@@ -206,7 +206,7 @@ def test_real_workers_end_with_their_parent_killed_or_stopped(quick_runs: Path, 
         wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 20)  # noqa: B023
         if number == signal.SIGINT:
             said = [line for line in err.splitlines() if line.strip() and "it/s" not in line and "step/s" not in line]
-            stopped = "stopped; the same command, without --overwrite, resumes from the last checkpoint"
+            stopped = "stopped; the same command, without --overwrite, resumes a run from its last checkpoint"
             assert process.returncode == 1 and said == [stopped]
     code, out, err = run("aib_repr", "--env-id", TASK, "--quick", cwd=tmp_path)
     assert code == 0, err

@@ -51,7 +51,7 @@ def test_tasks(tmp_path: Path, script: str, arguments: list[str], words: list[st
 
 
 def test_no_rendering_device(tmp_path: Path) -> None:
-    refused(run("aib_repr", cwd=tmp_path, env=NO_DRIVER), "sapien_cpu or physx_cpu does not start", "Troubleshooting")
+    refused(run("aib_repr", cwd=tmp_path, env=NO_DRIVER), "sapien_cpu or physx_cpu does not start", "docs/experiments.md")
     assert not list(tmp_path.iterdir())
 
 
@@ -62,7 +62,7 @@ def test_physx_without_its_library(capsys: pytest.CaptureFixture, monkeypatch: p
     monkeypatch.setattr(aib_repr.sapien.physx, "enable_gpu", enable_gpu)
     with pytest.raises(SystemExit) as stop:
         aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", robot_triangles=0))
-    refused((stop.value.code, *capsys.readouterr()), "physx_cuda does not start", "libcuda.so", "Troubleshooting")
+    refused((stop.value.code, *capsys.readouterr()), "physx_cuda does not start", "libcuda.so", "docs/experiments.md")
 
 
 def test_physx_is_downloaded_by_one_process_at_a_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
