@@ -51,7 +51,7 @@ def test_tasks(tmp_path: Path, script: str, arguments: list[str], words: list[st
 
 
 def test_no_rendering_device(tmp_path: Path) -> None:
-    refused(run("aib_repr", cwd=tmp_path, env=NO_DRIVER), "sapien_cpu or physx_cpu does not start", "docs/experiments.md")
+    refused(run("aib_repr", cwd=tmp_path, env=NO_DRIVER), "sapien_cpu or physx_cpu does not start", "experiments.md")
     assert not list(tmp_path.iterdir())
 
 
