@@ -3,14 +3,14 @@
 A belief is trained on episodes of the random policy. Once PPO has sent the arm elsewhere it may lose what it knew. This
 plays every second scene of stage 1's dataset once more with a trained agent, says how well its belief knew u there, and
 writes all episodes as a run of stage 1 with the same phi, on which stage 2 trains a refreshed belief. Half as many
-episodes come on top, so the stages after it need --num-episodes 3000 instead of 2000.
+episodes come on top, so the stages after it need --num-episodes 960 in place of --small's 640.
 
-Usage:   python benchmark/refresh.py --agent runs/RememberColor5-v0__ppo_aib_small__1/agent.pt
-         python aib_belief.py --env-id RememberColor5-v0 --small --num-episodes 3000 --beta 10 --num-updates 1800 \
+Usage:   python benchmark/refresh.py --agent runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
+         python aib_belief.py --env-id RememberColor3-v0 --small --num-episodes 960 \
              --repr-dir 'runs/{env_id}__aib_repr_refreshed__{seed}' --exp-name aib_belief_refreshed
-         python ppo_aib.py --env-id RememberColor5-v0 --small --num-episodes 3000 \
-             --belief 'runs/{env_id}__aib_belief_refreshed__{seed}/belief.pt' --exp-name ppo_aib_refreshed_small
-         (Believer: ppo_believer.py with --repr-dir and --exp-name ppo_believer_refreshed_small)
+         python ppo_aib.py --env-id RememberColor3-v0 --small --num-episodes 960 \
+             --belief 'runs/{env_id}__aib_belief_refreshed__{seed}/belief.pt' --exp-name ppo_aib_refreshed
+         (Believer: ppo_believer.py with --repr-dir and --exp-name ppo_believer_refreshed)
 Reads:   agent.pt of ppo_aib.py or ppo_believer.py; stage 1's dataset/ and repr.pt
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt
 """

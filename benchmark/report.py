@@ -14,6 +14,7 @@ import sys
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import matplotlib
 import numpy as np
@@ -76,9 +77,15 @@ class Args:
     runs: Path | None = None
     """report on this folder of run directories; none: rebuild README.md and docs/results.md"""
     add: str = ""
-    """append the runs to benchmark/results under this name of their setting, which settings.csv should explain"""
+    """append the runs to benchmark/results under this name of their setting, which settings.csv must have"""
     output: Path = Path("benchmark/report")
     """where the report on --runs goes"""
+
+
+def fail(message: str) -> NoReturn:
+    """Say on stderr what is wrong and what to do, and leave with exit code 2."""
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)
 
 
 # ---------------------------------------------------------------- data
@@ -91,15 +98,18 @@ def read(name: str) -> list[dict[str, str]]:
 
 
 def eval_rows(folder: Path, setting: str) -> list[dict]:
-    """Rows as in eval.csv of all runs in a folder; setting "" names each by its exp_name. --quick runs are left out."""
+    """Rows as in eval.csv of all runs in a folder; setting "" names each by its exp_name. --quick runs are left out.
+
+    The method follows from how exp_name begins; it is exp_name itself where that tells none.
+    """
     rows = []
     for file in sorted(folder.glob("*__*__*/eval.csv")):
         args = json.loads((file.parent / "args.json").read_text())
-        method = (METHODS | ORACLES).get(re.match("[a-z]+_[a-z]+", args["exp_name"])[0])
-        if args["quick"] or method is None:
+        if args["quick"]:
             continue
-        run = {"task": args["env_id"], "method": method, "seed": args["seed"]}
-        run["setting"] = setting or args["exp_name"]
+        name = args["exp_name"]
+        method = next((method for start, method in (METHODS | ORACLES).items() if name.startswith(start)), name)
+        run = {"task": args["env_id"], "method": method, "seed": args["seed"], "setting": setting or name}
         for row in csv.DictReader(file.open()):
             metrics = {name: f"{float(row[name]):.4f}" for name in METRICS if name in row}
             rows.append({**run, "step": row["global_step"], **metrics})
@@ -111,6 +121,8 @@ def belief_rows(folder: Path, setting: str) -> list[dict]:
     rows = []
     for file in sorted(folder.glob("*__*__*/diagnostics.json")):
         args = json.loads((file.parent / "args.json").read_text())
+        if args["quick"]:
+            continue
         run = {"task": args["env_id"], "method": HEADS[args.get("action_head")], "seed": args["seed"]}
         run["setting"] = setting or args["exp_name"]
         for metric, values in json.loads(file.read_text()).items():
@@ -143,7 +155,7 @@ def last_three(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[float]:
 
 
 def summarise(values: list[float]) -> str:
-    """Mean (each seed); from five seeds on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
+    """Mean (seeds, sorted); from five on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
     if len(values) < 2:
         return "".join(f"{value:.2f}" for value in values)
     if len(values) < 5:
@@ -187,7 +199,8 @@ def agents_table(evals: list[dict]) -> str:
             chosen = {"task": task, "method": method, "setting": setting}
             steps = min(curve[0][-1] for curve in by_seed(evals, "success_once", **chosen).values())
             episodes = re.search(r"--num-episodes (\d+)", repr_arguments[setting])
-            random_steps = 60 * int(episodes[1] if episodes else 640) if method != "PPO" else 0
+            length = 90 if task.startswith("Intercept") else 60
+            random_steps = length * int(episodes[1] if episodes else 640) if method != "PPO" else 0
             cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
             rows.append([task.removesuffix("-v0"), method, setting, f"{random_steps:,}", f"{steps:,.0f}", *cells])
     return markdown(["task", "method", "setting", "random steps", "PPO steps", *METRICS[:2]], rows)
@@ -404,8 +417,7 @@ def report_runs(args: Args) -> None:
     evals, beliefs = eval_rows(args.runs, ""), belief_rows(args.runs, "")
     tasks = sorted({row["task"] for row in evals})
     if not tasks:
-        print(f"error: no eval.csv below {args.runs}; name the folder of run directories with --runs", file=sys.stderr)
-        sys.exit(2)
+        fail(f"no eval.csv of a run without --quick below {args.runs}; name the folder of run directories with --runs")
     args.output.mkdir(parents=True, exist_ok=True)
     figure, axes = plt.subplots(1, len(tasks), figsize=(5 * len(tasks), 4), layout="constrained", squeeze=False)
     for ax, task in zip(axes[0], tasks, strict=True):
@@ -426,6 +438,8 @@ def main(args: Args) -> None:
     if args.runs is None:
         rebuild(ROOT)
     elif args.add:
+        if args.add not in [row["setting"] for row in read("settings.csv")]:
+            fail(f"benchmark/results/settings.csv has no --add {args.add}; describe that setting there first")
         append("eval.csv", KEY + METRICS, eval_rows(args.runs, args.add))
         append("beliefs.csv", [*KEY, "metric", "value"], belief_rows(args.runs, args.add))
     else:

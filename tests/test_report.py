@@ -36,12 +36,13 @@ def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     for seed, values in ((1, [0.9, 0.5, 0.6, 0.7]), (2, [0.1, 0.4, 0.5, 0.6]), (3, [0.0, 0.7, 0.8, 0.9])):
         record(tmp_path, "ppo_aib", seed, values)
     record(tmp_path, "ppo_baseline", 1, [0.0, 0.1, 0.3])
+    record(tmp_path, "published_ppo", 1, [0.25])
     record(tmp_path, "ppo_believer_quick", 1, [1.0], quick=True)
     belief = {"cue_from_h": [0.0] * 60 + [0.9], "cue_from_particle": [0.5] * 61, "u_r2_prior": [0.25] * 61}
     belief |= {"nll_prior": -3.0, "nll_posterior": -4.0, "action_readout": 0.5}
     path = tmp_path / f"{TASK}__aib_belief__1"
     path.mkdir()
-    arguments = {"env_id": TASK, "exp_name": "aib_belief", "seed": 1, "action_head": "none"}
+    arguments = {"env_id": TASK, "exp_name": "aib_belief", "seed": 1, "action_head": "none", "quick": False}
     (path / "args.json").write_text(json.dumps(arguments))
     (path / "diagnostics.json").write_text(json.dumps(belief))
     report.main(report.Args(runs=tmp_path, output=tmp_path / "report"))
@@ -51,6 +52,7 @@ def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     assert f"| success_once | ppo_aib, 4,000 steps | {aib} |" in text
     assert "| success_at_end | ppo_aib, 4,000 steps | 0.32 (0.25, 0.30, 0.40) |" in text
     assert "| success_once | ppo_baseline, 3,000 steps | 0.13 | 0.30 |" in text
+    assert "| success_once | published_ppo, 1,000 steps | 0.25 | 0.25 |" in text
     assert "| success_once | AIB, the paper's | 0.82 ± 0.04 | 0.87 ± 0.01 |" in text
     assert "| aib_belief | 0.90 | 0.50 | 0.25 | -3.00 | -4.00 | 0.50 |  |" in text
     assert "quick" not in text
@@ -70,6 +72,11 @@ def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(report, "RESULTS", tmp_path)
     (tmp_path / "eval.csv").write_text(",".join(report.KEY + report.METRICS) + "\n")
     (tmp_path / "beliefs.csv").write_text(",".join([*report.KEY, "metric", "value"]) + "\n")
+    (tmp_path / "settings.csv").write_text("setting,aib_repr,aib_belief,ppo,note\n")
+    with pytest.raises(SystemExit):
+        report.main(report.Args(runs=tmp_path, add="pink noise"))
+    assert report.read("eval.csv") == []
+    (tmp_path / "settings.csv").write_text("setting,aib_repr,aib_belief,ppo,note\npink noise,,,--noise-beta 1,\n")
     report.main(report.Args(runs=tmp_path, add="pink noise"))
     rows = report.read("eval.csv")
     assert [row["success_once"] for row in rows] == ["0.2500", "0.5000"]
