@@ -40,7 +40,7 @@ from tqdm import tqdm
 FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -58,17 +58,17 @@ class Args:
     device: Literal["cpu", "cuda"] = "cuda" if CUDA else "cpu"
     """where the networks live"""
     sim_backend: Literal["physx_cpu", "physx_cuda"] = "physx_cuda" if CUDA else "physx_cpu"
-    """physics: one process per scene, or all scenes as one batch on the GPU"""
+    """physx_cpu: one process per scene; physx_cuda: all scenes as one batch on the GPU"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """at most so many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """at most this many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results change by rounding"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
-    """smaller than the paper, for a CPU and an hour or two; tuned on RememberColor3-v0"""
+    """a reduced setting for a CPU and an hour or two; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -77,7 +77,7 @@ class Args:
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """episodes of the random policy behind the belief; stage 1 collects them where they are missing"""
+    """random episodes that the belief is trained on; stage 1 collects them if they are missing"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper calls them epochs"""
     batch_episodes: int = 256
@@ -93,9 +93,9 @@ class Args:
     action_lambda: float = 1.0
     """weight of the action head's loss"""
     fm_latent: Literal["mean", "sample"] = "mean"
-    """what the action head sees of the posterior; samples, as the paper says, are mostly noise at the start"""
+    """what the action head gets of the posterior; sample is the paper's, but mostly noise early in training"""
     bptt_steps: int | None = None
-    """cut back-propagation through time after so many steps; None: never"""
+    """cut back-propagation through time after this many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
     """subtract the dataset's mean image and divide by what varies, or just divide by 255"""
     chrono_init: bool = True
@@ -105,14 +105,14 @@ class Args:
     history_joints: bool = True
     """joints in the history, as in the paper; its authors' code has the image alone"""
     image_shift: int = 0
-    """shift each episode's images by up to so many pixels while the belief is trained, against overfitting"""
+    """shift each episode's images by up to this many pixels while the belief is trained, against overfitting"""
     belief_amp: bool = BFLOAT16
     """image network in bfloat16 while the belief is trained"""
     val_every: int = 50
     """updates between checkpoints, each with a validation"""
 
 
-# (lowest, highest) of an argument; of others: whole numbers at least 1, fractions at least 0
+# (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_shift=(0, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
@@ -230,7 +230,7 @@ def chrono_init(gru: nn.GRU, steps: int) -> None:
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h); phi, to measure them (paper 3.2).
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2); phi measures accuracy.
 
     config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
@@ -256,7 +256,7 @@ class AIBBelief(nn.Module):
 def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int | None = None) -> Tensor:
     """h (T, B, 256) of whole episodes: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
 
-    All T * B frames go through the CNN at once, or, where their activations would not fit, in chunks with gradient
+    All T * B frames go through the CNN at once, or, where they are more than CNN_CHUNK, in chunks with gradient
     checkpointing. bptt_steps truncates back-propagation through time.
     """
     frames = [batch[name].flatten(0, 1).split(CNN_CHUNK) for name in ("rgb", "joints")]
@@ -340,7 +340,7 @@ class EpisodeDataset:
 
 
 def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
-    """Shift each episode's images rgb (T+1, B, H, W, 3) in place by up to so many pixels, wrapping at the edges."""
+    """Shift each episode's images rgb (T+1, B, H, W, 3) in place by up to this many pixels, wrapping at the edges."""
     shifts = rng.integers(-pixels, pixels, (rgb.shape[1], 2), endpoint=True)
     for images, shift in zip(rgb.unbind(1), shifts.tolist(), strict=True):
         images.copy_(images.roll(shift, (1, 2)))
@@ -418,7 +418,7 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
 
 
 def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
-    """What the belief remembers, lists by time step.
+    """What the belief remembers: lists by time step and, from nll to chance, single numbers.
 
     fit and test are encode's of two sets of episodes that the belief was not trained on: linear probes are fitted on
     the first and everything is measured on the second.
@@ -506,7 +506,7 @@ def main(args: Args) -> None:
         losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # an outlier can undo the memory
+        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # one outlier can undo the memory
         optimizer.step()
         if update % 10 == 0:
             for name, value in losses.items():

@@ -46,7 +46,7 @@ from tqdm import tqdm
 
 FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -64,24 +64,24 @@ class Args:
     device: Literal["cpu", "cuda"] = "cuda" if CUDA else "cpu"
     """where the networks live"""
     sim_backend: Literal["physx_cpu", "physx_cuda"] = "physx_cuda" if CUDA else "physx_cpu"
-    """physics: one process per scene, or all scenes as one batch on the GPU"""
+    """physx_cpu: one process per scene; physx_cuda: all scenes as one batch on the GPU"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """at most so many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """at most this many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results change by rounding"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
-    """smaller than the paper, for a CPU and an hour or two; tuned on RememberColor3-v0"""
+    """a reduced setting for a CPU and an hour or two; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
     """delete what the run directory holds and start again; to resume, leave it out"""
 
     num_envs: int = 50
-    """at most so many scenes at a time; physx_cuda draws one arm pose for all of them"""
+    """at most this many scenes at a time; physx_cuda draws one arm pose for all of them"""
     num_episodes: int = 2000
     """episodes of the random policy; 640 are enough for RememberColor3-v0, not for harder tasks"""
     noise_beta: float = 0.0
@@ -114,7 +114,7 @@ class Args:
     """image network in bfloat16"""
 
 
-# (lowest, highest) of an argument; of others: whole numbers at least 1, fractions at least 0
+# (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), val_fraction=(0, 1), noise_beta=(0, 2))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
@@ -553,7 +553,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
-    gym.logger.min_level = gym.logger.ERROR  # that a run is stopped in the middle of a step deserves no warning
+    gym.logger.min_level = gym.logger.ERROR  # no warning when a run is stopped in the middle of a step
     return envs
 
 

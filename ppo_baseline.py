@@ -46,9 +46,9 @@ from tqdm import tqdm
 
 FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()
-EVAL_SEED = 2**30 + 2**29  # first seed of the evaluations while training, whose seeds lie below 2**30
-TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, whose episodes no choice has seen
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
+EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; training has those below 2**30, stage 1 those between
+TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, never used for training or tuning
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -66,17 +66,17 @@ class Args:
     device: Literal["cpu", "cuda"] = "cuda" if CUDA else "cpu"
     """where the networks live"""
     sim_backend: Literal["physx_cpu", "physx_cuda"] = "physx_cuda" if CUDA else "physx_cpu"
-    """physics: one process per scene, or all scenes as one batch on the GPU"""
+    """physx_cpu: one process per scene; physx_cuda: all scenes as one batch on the GPU"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """at most so many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """at most this many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Results change by rounding"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
-    """smaller than the paper, for a CPU and an hour or two; tuned on RememberColor3-v0"""
+    """a reduced setting for a CPU and an hour or two; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -103,13 +103,13 @@ class Args:
     vf_coef: float = 0.5
     """weight of the value loss"""
     max_grad_norm: float = 0.5
-    """gradients are scaled down to this norm"""
+    """largest norm of the gradient"""
     target_kl: float = 0.05
     """the update ends before the first minibatch whose approx_kl is larger"""
     eval_every: int = 25
     """iterations between evaluations"""
     num_eval_episodes: int = 192
-    """episodes per evaluation, the same every time; those of --evaluate are others"""
+    """episodes per evaluation, always the same ones; --evaluate plays others"""
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
     noise_beta: float = 0.0
@@ -117,12 +117,12 @@ class Args:
     amp: bool = False
     """image network in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint, with the env_id, robot, num_envs and precision that are stored in it"""
+    """only evaluate --checkpoint, with the task, robot, sizes and precision that are stored in it"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
 
-# (lowest, highest) of an argument; of others: whole numbers at least 1, fractions at least 0
+# (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
 LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "evaluate", "checkpoint")  # when a run is resumed
@@ -219,7 +219,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
         "value_loss": value_loss,
         "entropy": entropy,
         "total": policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss,
-        "approx_kl": (ratio - 1 - log_ratio).mean().detach(),  # Schulman's low-variance estimate
+        "approx_kl": (ratio - 1 - log_ratio).mean(),  # Schulman's low-variance estimate
         "clipfrac": (ratio != clipped).float().mean(),
     }
 
@@ -240,7 +240,7 @@ def rollout(
 ) -> dict[str, Tensor]:
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
-    Returns arrays (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; and values (T+1, N), V(o_T)
+    Returns tensors (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; and values (T+1, N), V(o_T)
     last. Episodes are played in rounds of envs.num_envs; all noise is drawn before, so that their size does not matter.
     """
     num_episodes, steps, device = len(seeds), gym.spec(args.env_id).max_episode_steps, torch.device(args.device)
@@ -252,7 +252,7 @@ def rollout(
     name = "evaluation" if deterministic else "rollout"
     bar = tqdm(total=len(rounds) * steps, desc=name, unit="step", unit_scale=envs.num_envs, leave=False)
     for first in rounds:
-        # the last round is filled up with repetitions; only the new ones are kept
+        # the last round is filled up with repeated episodes; new are those to keep
         rows = np.arange(first, first + envs.num_envs) % num_episodes
         new = rows[: num_episodes - first]
         obs, info = envs.reset(seed=seeds[rows].tolist())
@@ -301,7 +301,7 @@ def evaluate(
     envs: gym.vector.VectorEnv, agent: Agent, args: Args, first_seed: int = EVAL_SEED
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time."""
-    torch.manual_seed(0)  # main seeds each iteration anew
+    torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
     return success_and_return(buffer), make_video(buffer)
 
@@ -347,15 +347,15 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     agent = Agent(envs, args).to(device)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    done, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
+    completed, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        print(f"resuming {path} at step {done * per_iteration:,}", flush=True)
-    writer = SummaryWriter(path, purge_step=done * per_iteration + 1)
-    bar = tqdm(total=num_iterations * per_iteration, initial=done * per_iteration, desc="PPO", unit="step")
+        print(f"resuming {path} at step {completed * per_iteration:,}", flush=True)
+    writer = SummaryWriter(path, purge_step=completed * per_iteration + 1)
+    bar = tqdm(total=num_iterations * per_iteration, initial=completed * per_iteration, desc="PPO", unit="step")
 
-    for iteration in range(done + 1, num_iterations + 1):
+    for iteration in range(completed + 1, num_iterations + 1):
         start, global_step = time.time(), iteration * per_iteration
         torch.manual_seed(args.seed * 1_000_000 + iteration)  # so that a resumed run repeats the iteration
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
@@ -383,11 +383,11 @@ def main(args: Args) -> None:
                 break
         for name in losses:
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in stepped or [losses]]).mean().item()
-        explained = 1 - batch["advantages"].var() / batch["returns"].var()  # advantages are returns - values
+        explained = 1 - batch["advantages"].var() / batch["returns"].var()  # of returns - values, the advantages
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(stepped)}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
-        del buffer, batch, losses  # a gigabyte of images and a graph: not two at a time
+        del buffer, batch, losses  # a gigabyte of images, before the evaluation has its own
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
             metrics, video = evaluate(envs, agent, args)
@@ -553,7 +553,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
-    gym.logger.min_level = gym.logger.ERROR  # that a run is stopped in the middle of a step deserves no warning
+    gym.logger.min_level = gym.logger.ERROR  # no warning when a run is stopped in the middle of a step
     return envs
 
 
