@@ -5,8 +5,10 @@ tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) sh
 that shape to the prior, which is what the robot has when it acts.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
-Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where they are missing, aib_repr.py runs first
-Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, TensorBoard events
+Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt, or --repr-dir; if the former are missing,
+         aib_repr.py runs first
+Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, TensorBoard events; args.json and
+         checkpoint.pt to resume
 """
 
 import ctypes

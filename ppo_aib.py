@@ -5,9 +5,9 @@ turns them into a vector that joins image and joints as the input of actor and c
 
 Usage:   python ppo_aib.py --env-id InterceptFast-v0
          python ppo_aib.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_aib__1/agent.pt
-Reads:   runs/{env_id}__aib_belief__{seed}/belief.pt; where it is missing, aib_belief.py runs first
+Reads:   runs/{env_id}__aib_belief__{seed}/belief.pt, or --belief; if the former is missing, aib_belief.py runs first
 Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events; args.json and
-         checkpoint.pt to resume
+         checkpoint.pt to resume; with --evaluate evaluation.json and .mp4 beside agent.pt
 """
 
 import ctypes

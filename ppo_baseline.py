@@ -3,7 +3,7 @@
 Usage:   python ppo_baseline.py --env-id InterceptFast-v0
          python ppo_baseline.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_baseline__1/agent.pt
 Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events; args.json and
-         checkpoint.pt to resume
+         checkpoint.pt to resume; with --evaluate evaluation.json and .mp4 beside agent.pt
 """
 
 import difflib

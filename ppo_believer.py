@@ -1,13 +1,14 @@
-"""The Believer baseline end to end (Wang et al., 2023): a belief with a fixed prior, then PPO on it and observation.
+"""The Believer baseline after stage 1 (Wang et al., 2023): a belief with a fixed prior, then PPO on observation and it.
 
 Where aib_belief.py learns a prior p(z|h) and shapes z by inverse dynamics, Believer draws z from N(0, I) and has no
 action head. Networks, settings, PPO, evaluation and tags are those of aib_belief.py and ppo_aib.py.
 
 Usage:   python ppo_believer.py --env-id InterceptFast-v0
          python ppo_believer.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_believer__1/agent.pt
-Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where they are missing, aib_repr.py runs first
+Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt, or --repr-dir; if the former are missing,
+         aib_repr.py runs first
 Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, agent.pt, eval.csv, videos/, TensorBoard events; args.json and
-         checkpoint.pt to resume
+         checkpoint.pt to resume; with --evaluate evaluation.json and .mp4 beside agent.pt
 """
 
 import ctypes
