@@ -50,6 +50,7 @@ RESULTS_ROWS = [  # of README: task, setting; no setting: not run with pictures
 ]
 BELIEF_ROWS = [  # of docs/results.md: task and setting of stage 2
     ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.01, psi without images"),
+    ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.03, psi without images"),
     ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.003"),
     ("RememberColor5-v0", "2000 episodes, 600 updates, stage-1 KL 0.01"),
     ("RememberColor5-v0", "2000 episodes, 600 updates, stage-1 KL 0.01, another u"),
