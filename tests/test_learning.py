@@ -11,7 +11,7 @@ import aib_belief
 import aib_repr
 from conftest import SCRIPTS, train
 
-REPR = dict(num_episodes=300, epochs=12, batch_size=100, learning_rate=1e-3, num_workers=100)
+REPR = dict(num_episodes=300, epochs=12, batch_size=100, learning_rate=1e-3, psi_images=False, num_workers=100)
 BELIEF = dict(num_episodes=300, num_updates=150, batch_episodes=24, belief_lr=1e-3, val_every=50)
 PPO = dict(total_timesteps=64 * 10 * 12, num_envs=64, learning_rate=1e-3, num_minibatches=8, update_epochs=4)
 PPO |= dict(eval_every=5, num_eval_episodes=192, ent_coef=0.0, num_workers=64)
