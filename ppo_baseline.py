@@ -301,7 +301,6 @@ def evaluate(
     envs: gym.vector.VectorEnv, agent: Agent, args: Args, first_seed: int = EVAL_SEED
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time."""
-    torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
     return success_and_return(buffer), make_video(buffer)
 

@@ -68,9 +68,10 @@ def describe(state: np.ndarray, cue: np.ndarray, u: np.ndarray, train: int) -> d
 @torch.no_grad()
 def shift(args: Args, states: torch.Tensor, cue_dim: int, num_val: int) -> dict[tuple[int, str], float]:
     """Metrics by time step of a belief on the held-out scenes of a refreshed dataset with states (N, T+1, D)."""
-    config = load(args.belief, "name a belief.pt of aib_belief.py with --belief", kind="aib_belief")["config"]
+    stored = load(args.belief, "name a belief.pt of aib_belief.py with --belief", kind="aib_belief")
+    config = stored["config"]
     belief = AIBBelief(config)
-    belief.load_state_dict(load(args.belief, "")["belief"])
+    belief.load_state_dict(stored["belief"])
     u = belief.phi(states).mean
     target = torch.from_numpy(target_position(states.flatten(0, 1).numpy(), cue_dim)[:, :2]).unflatten(0, u.shape[:2])
     _, by_agent = rows_of(len(states) * 2 // 3)
