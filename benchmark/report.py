@@ -3,7 +3,8 @@
 Usage:   python benchmark/report.py                                  (README.md, docs/results.md and their figures)
          python benchmark/report.py --runs runs                      (learning curves and last values of your runs)
          python benchmark/report.py --runs runs --add "coloured noise"   (append your runs to eval.csv, beliefs.csv)
-Reads:   benchmark/results/: eval.csv, beliefs.csv, paper.csv; or runs/*/: args.json with eval.csv, diagnostics.json
+Reads:   benchmark/results/: eval.csv, beliefs.csv, paper.csv, tables.csv (which rows tables show, in order);
+         or runs/*/: args.json with eval.csv, diagnostics.json
 Writes:  tables between <!-- name --> and <!-- end --> in the pages, PNG figures; or benchmark/report/
 """
 
@@ -39,36 +40,6 @@ CHANCE = {  # one of so many objects is the right one
     "RememberColor9-v0": 1 / 9,
     "RememberShapeAndColor3x2-v0": 1 / 6,
 }
-RESULTS_ROWS = [  # of README: task, setting; no setting: not run with pictures
-    ("RememberShapeAndColor3x2-v0", ""),
-    ("RememberColor9-v0", ""),
-    ("InterceptMedium-v0", ""),
-    ("InterceptFast-v0", ""),
-    ("RememberColor3-v0", "white noise"),
-    ("RememberColor3-v0", "coloured noise"),
-    ("RememberColor5-v0", "white noise, KL weight 10"),
-]
-BELIEF_ROWS = [  # of docs/results.md: task and setting of stage 2
-    ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.01, psi without images"),
-    ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.03, psi without images"),
-    ("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.003"),
-    ("RememberColor5-v0", "2000 episodes, 600 updates, stage-1 KL 0.01"),
-    ("RememberColor5-v0", "2000 episodes, 600 updates, stage-1 KL 0.01, another u"),
-    ("RememberColor5-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003"),
-    ("RememberColor5-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10"),
-    ("RememberColor5-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10, image shift 4"),
-    ("RememberShapeAndColor3x2-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
-    ("RememberShapeAndColor3x2-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10"),
-    ("RememberShapeAndColor3x2-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10, image shift 4"),
-    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003, trained on 270"),
-    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003, trained on 900"),
-    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
-    ("RememberColor9-v0", "2000 episodes, 700 updates, stage-1 KL 0.003, KL weight 10"),
-    ("RememberColor9-v0", "2000 episodes, 1200 updates, stage-1 KL 0.003, KL weight 10, image shift 4"),
-    ("InterceptFast-v0", "2000 episodes, 700 updates, stage-1 KL 0.003"),
-    ("InterceptFast-v0", "2000 episodes, 1400 updates, stage-1 KL 0.003"),
-    ("InterceptMedium-v0", "2000 episodes, 2400 updates, stage-1 KL 0.01"),
-]
 HEAD_SETTING = "2000 episodes, 700 updates, stage-1 KL 0.003"
 ORACLE_STEPS = (28800, 57600, 86400, 144000, 240000)
 
@@ -96,6 +67,11 @@ def read(name: str) -> list[dict[str, str]]:
     """The rows of one of benchmark/results' CSV files."""
     with (RESULTS / name).open() as file:
         return list(csv.DictReader(file))
+
+
+def rows_of(table: str) -> list[tuple[str, str]]:
+    """Task and setting of each row of a table; README's has rows of tasks that were not run, without a setting."""
+    return [(row["task"], row["setting"]) for row in read("tables.csv") if row["table"] == table]
 
 
 def eval_rows(folder: Path, setting: str) -> list[dict]:
@@ -178,7 +154,7 @@ def results_table(evals: list[dict]) -> str:
     """README's: per task success_once of the paper and here, mean of the last three evaluations."""
     paper = {(row["task"], row["method"]): row for row in read("paper.csv") if row["metric"] == "success_once"}
     rows = []
-    for task, setting in RESULTS_ROWS:
+    for task, setting in rows_of("results"):
         row = [task.removesuffix("-v0"), f"{CHANCE[task]:.2f}" if task in CHANCE else ""]
         for method in METHODS.values():
             theirs = paper.get((task, method))
@@ -216,7 +192,7 @@ def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metri
 def beliefs_table(beliefs: list[dict]) -> str:
     """What AIB's beliefs know at the last step of held-out random episodes."""
     rows = []
-    for task, setting in BELIEF_ROWS:
+    for task, setting in rows_of("beliefs"):
         cells = []
         for metric in ("cue_from_u", "cue_from_h", "cue_from_particle", "u_r2_prior"):
             cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
@@ -324,9 +300,9 @@ def save_figure(figure: plt.Figure, axes: np.ndarray, path: Path) -> None:
 
 
 def learning_curves(evals: list[dict], path: Path) -> None:
-    """success_once of the three methods in every row of RESULTS_ROWS that has runs, with the chance level."""
+    """success_once of the three methods in every row of README's table that has runs, with the chance level."""
     panels = []
-    for task, setting in RESULTS_ROWS:
+    for task, setting in rows_of("results"):
         if by_seed(evals, "success_once", task=task, setting=setting):
             panels.append((task, setting))
     figure, axes = plt.subplots(
