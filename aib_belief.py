@@ -40,7 +40,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
-CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
+CNN_CHUNK = 2048  # images through a belief's CNN at a time; their activations take 1 to 2 GB
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -66,7 +66,7 @@ class Args:
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """at most this many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """decimate robot meshes to about so many, the ground to two; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -81,7 +81,7 @@ class Args:
     num_episodes: int = 2000
     """random episodes that the belief is trained on; stage 1 collects them if they are missing"""
     num_updates: int = 10_000
-    """gradient updates of the belief; the paper calls them epochs"""
+    """gradient updates of the belief; taken for the paper's epochs (Table 3)"""
     batch_episodes: int = 256
     """whole episodes per update of the belief"""
     belief_lr: float = 3e-4
@@ -95,11 +95,11 @@ class Args:
     action_lambda: float = 1.0
     """weight of the action head's loss"""
     fm_latent: Literal["mean", "sample"] = "mean"
-    """what the action head gets of the posterior; sample is the paper's, but mostly noise early in training"""
+    """z that the action head gets: q's means, or samples, the paper's, which are mostly noise early in training"""
     bptt_steps: int | None = None
     """cut back-propagation through time after this many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
-    """subtract the dataset's mean image and divide by what varies, or just divide by 255"""
+    """subtract the dataset's mean image and divide by the std of what is left, one number; or divide by 255"""
     chrono_init: bool = True
     """GRU gates that start out remembering for up to an episode (Tallec and Ollivier, 2018)"""
     gru_layers: int = 1
@@ -196,7 +196,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has the actions too; here only the joints, which the actions move.
+    The paper's history (E.2) has past actions, too; with them h_{t+1} would hold a_t, for the action head to copy.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -223,8 +223,8 @@ class HistoryEncoder(nn.Module):
 
 
 def chrono_init(gru: nn.GRU, steps: int) -> None:
-    """Let the GRU start out remembering for 2 to steps steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
-    gate = slice(gru.hidden_size, 2 * gru.hidden_size)  # torch orders the gates reset, update, new
+    """Let the GRU begin with time constants of 2 to steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
+    gate = slice(gru.hidden_size, 2 * gru.hidden_size)  # after the reset gate; h' = (1 - gate) n + gate h
     for layer in range(gru.num_layers):
         with torch.no_grad():
             getattr(gru, f"bias_ih_l{layer}")[gate] = torch.empty(gru.hidden_size).uniform_(1, steps - 1).log()
@@ -232,7 +232,7 @@ def chrono_init(gru: nn.GRU, steps: int) -> None:
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2); phi measures accuracy.
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2); phi, for evaluations, stays fixed.
 
     config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
@@ -243,7 +243,7 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # for evaluations
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # no loss has it
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
@@ -299,7 +299,8 @@ def flow_matching_loss(
 def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """L_Total = -L_VAE (KL weighted by beta) + lambda L_FM, and its terms, means over all steps of whole episodes.
 
-    With args.action_head mse, the squared error of the actions stands in L_FM's place.
+    L_FM gets the means of q, with args.fm_latent sample its samples, as in the paper. With args.action_head mse, the
+    squared error of the actions stands in L_FM's place.
     """
     h = encode_history(model["belief"].history, batch, args.bptt_steps)
     nll, kl, z, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
@@ -420,10 +421,11 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
 
 
 def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
-    """What the belief remembers: lists by time step and, from nll to chance, single numbers.
+    """What the belief knows of the episodes test (encode's); linear probes are fitted on the episodes fit.
 
-    fit and test are encode's of two sets of episodes that the belief was not trained on: linear probes are fitted on
-    the first and everything is measured on the second.
+    By time step: u_r2_prior, u_r2_posterior, R2 of u from the mean particle and from z_mean decoded; cue_from_h,
+    cue_from_particle, cue_from_u, probes of the memory variable. Single numbers: nll_prior, nll_posterior, means;
+    action_readout, probe of a_t from z_mean at t and t + 1; cue_chance, accuracy of guessing (0 for R2).
     """
     report = {name: test[name].mean().item() for name in ("nll_prior", "nll_posterior")}
     for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
@@ -508,7 +510,7 @@ def main(args: Args) -> None:
         losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # one outlier can undo the memory
+        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # or one bad batch makes it forget
         optimizer.step()
         if update % 10 == 0:
             for name, value in losses.items():
@@ -525,7 +527,7 @@ def main(args: Args) -> None:
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
 
-    # the last weights are kept: held-out error and likelihood are best early, when the belief does not yet remember
+    # no early stopping: held-out error and likelihood are best before the cue can be read from h
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = probe_belief(fit, test)
     if args.action_head == "flow":

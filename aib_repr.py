@@ -70,7 +70,7 @@ class Args:
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """at most this many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """decimate robot meshes to about so many, the ground to two; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -252,7 +252,7 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> d
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Gaussian noise of shape (..., T), N(0, 1) at every step, spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    """Gaussian noise of shape (..., T), spectrum 1/f**beta over time (Eberhard et al., 2023), each step N(0, 1.00)."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
     return noise * np.sqrt(power[1:].sum() / power.sum())  # the package leaves f = 0 out when it scales the std to 1
@@ -267,7 +267,8 @@ def random_actions(args: Args, episode: int, steps: int, action_dim: int) -> np.
 def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     """Fill dataset/ from where it stopped with N whole episodes of the uniformly random policy; its memory maps:
 
-    rgb (N, T+1, H, W, 3) uint8; joints, state (N, T+1, .); actions (N, T, A); rewards, success (N, T); cue (N, K).
+    rgb (N, T+1, H, W, 3) uint8; joints, state (N, T+1, .); actions (N, T, A); rewards, success (N, T); cue, the memory
+    variable (N, K).
     """
     meta = {"format": FORMAT, **asdict(args), "camera": "base_camera", "episodes_done": 0}
     if (path / "meta.json").exists():
@@ -422,7 +423,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
     """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all task facts, the cue too.
     """
 
     def __init__(self, env: gym.Env):
@@ -440,7 +441,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
-        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()
+        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()  # a copy; the next is drawn over it
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
@@ -503,7 +504,7 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
             for part in shape.parts:
                 mesh = trimesh.Trimesh(part.vertices, part.triangles, process=False)
                 if len(mesh.faces) > triangles:
-                    mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files no two triangles share any
+                    mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files triangles share none
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
                 arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))

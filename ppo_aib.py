@@ -80,7 +80,7 @@ class Args:
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """at most this many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """decimate robot meshes to about so many, the ground to two; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -225,7 +225,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has the actions too; here only the joints, which the actions move.
+    The paper's history (E.2) has past actions, too; with them h_{t+1} would hold a_t, for the action head to copy.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -252,7 +252,7 @@ class HistoryEncoder(nn.Module):
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2); phi measures accuracy.
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2); phi, for evaluations, stays fixed.
 
     config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
@@ -263,7 +263,7 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # for evaluations
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # no loss has it
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
@@ -300,7 +300,10 @@ class Agent(nn.Module):
 
 
 def compute_gae(rewards: Tensor, values: Tensor, gamma: float, gae_lambda: float) -> Tensor:
-    """Generalised advantages (T, N) of whole episodes: rewards (T, N), values (T+1, N) with V(o_T) as the last."""
+    """Generalised advantages (T, N) of whole episodes: rewards (T, N), values (T+1, N) with V(o_T) as the last.
+
+    No done flags: a success ends no episode, and the time limit is a truncation, so V(o_T) is bootstrapped.
+    """
     advantages, last = torch.empty_like(rewards), torch.zeros_like(rewards[0])
     deltas = rewards + gamma * values[1:] - values[:-1]
     for t in reversed(range(len(rewards))):
@@ -333,7 +336,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Gaussian noise of shape (..., T), N(0, 1) at every step, spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    """Gaussian noise of shape (..., T), spectrum 1/f**beta over time (Eberhard et al., 2023), each step N(0, 1.00)."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
     return noise * np.sqrt(power[1:].sum() / power.sum())  # the package leaves f = 0 out when it scales the std to 1
@@ -362,12 +365,12 @@ def rollout(
         u_noise.zero_()
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     rounds = range(0, num_episodes, envs.num_envs)
-    name = "evaluation" if deterministic else "rollout"
-    bar = tqdm(total=len(rounds) * steps, desc=name, unit="step", unit_scale=envs.num_envs, leave=False)
+    desc = "evaluation" if deterministic else "rollout"
+    bar = tqdm(total=len(rounds) * steps, desc=desc, unit="step", unit_scale=envs.num_envs, leave=False)
     for first in rounds:
-        # the last round is filled up with repeated episodes; new are those to keep
+        # the last round is filled up with repeated episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
-        new = rows[: num_episodes - first]
+        kept = rows[: num_episodes - first]
         obs, info = envs.reset(seed=seeds[rows].tolist())
         hidden = None
         for t in range(steps + 1):
@@ -377,7 +380,7 @@ def rollout(
             p_u = agent.belief.decode(h[0], z_noise[t, rows])
             step["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
             dist, values = agent(step)
-            buffer["values"][t, new] = values[: len(new)]
+            buffer["values"][t, kept] = values[: len(kept)]
             if t == steps:
                 break  # the last observation is only for its value
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
@@ -390,7 +393,7 @@ def rollout(
             for name, x in step.items():
                 if name not in buffer:
                     buffer[name] = torch.empty(steps, num_episodes, *x.shape[1:], dtype=x.dtype, device=device)
-                buffer[name][t, new] = x[: len(new)]
+                buffer[name][t, kept] = x[: len(kept)]
             bar.update()
     bar.close()
     return buffer
@@ -428,8 +431,8 @@ def evaluate(
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    u_r2, u_r2_at_end: what the belief knows where its agent takes it, R2 of u = phi(s) from the mean particle, over all
-    steps and at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
+    u_r2, u_r2_at_end: R2 of u = phi(s) from the mean particle in the states that this agent visits, over all steps and
+    at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
     """
     torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
@@ -483,7 +486,7 @@ def main(args: Args) -> None:
     task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "num_episodes")}
     stored = load(file, hint, kind="aib_belief", **task)
     for name, x in stored["belief"].items():
-        if checkpoint and not torch.equal(checkpoint["agent"][f"belief.{name}"], x):
+        if checkpoint and not torch.equal(checkpoint["agent"].get(f"belief.{name}", torch.empty(0)), x):
             fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
     open_run(path, args)
 
@@ -513,7 +516,7 @@ def main(args: Args) -> None:
         buffer["advantages"] = compute_gae(buffer["rewards"], values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
-        stepped = []  # the losses of the minibatches that were stepped on
+        applied = []  # losses of the minibatches that led to an optimizer step
         for _ in range(args.update_epochs):
             for mb_inds in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
                 losses = ppo_losses(agent, {name: x[mb_inds] for name, x in batch.items()}, args)
@@ -523,13 +526,13 @@ def main(args: Args) -> None:
                 losses["total"].backward()
                 nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
                 optimizer.step()
-                stepped.append({name: x.detach() for name, x in losses.items()})
+                applied.append({name: x.detach() for name, x in losses.items()})
             if losses["approx_kl"] > args.target_kl:
                 break
         for name in losses:
-            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in stepped or [losses]]).mean().item()
-        explained = 1 - batch["advantages"].var() / batch["returns"].var()  # of returns - values, the advantages
-        scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(stepped)}
+            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
+        explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
+        scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
         del buffer, batch, losses  # a gigabyte of images, before the evaluation has its own
@@ -567,7 +570,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
     """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all task facts, the cue too.
     """
 
     def __init__(self, env: gym.Env):
@@ -585,7 +588,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
-        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()
+        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()  # a copy; the next is drawn over it
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
@@ -648,7 +651,7 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
             for part in shape.parts:
                 mesh = trimesh.Trimesh(part.vertices, part.triangles, process=False)
                 if len(mesh.faces) > triangles:
-                    mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files no two triangles share any
+                    mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files triangles share none
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
                 arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))

@@ -56,7 +56,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
-CNN_CHUNK = 2048  # images through a belief's CNN at a time: their activations take 1 to 2 GB, by arithmetic
+CNN_CHUNK = 2048  # images through a belief's CNN at a time; their activations take 1 to 2 GB
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
 EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; training has those below 2**30, stage 1 those between
@@ -84,7 +84,7 @@ class Args:
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
     """with or without a camera at its wrist, whose image is never used"""
     robot_triangles: int = 0 if CUDA else 500
-    """at most this many per robot mesh, and two for the ground; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """decimate robot meshes to about so many, the ground to two; 500: a CPU steps 10 times as fast; 0: untouched"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -99,7 +99,7 @@ class Args:
     num_episodes: int = 2000
     """random episodes that the belief is trained on; stage 1 collects them if they are missing"""
     num_updates: int = 10_000
-    """gradient updates of the belief; the paper calls them epochs"""
+    """gradient updates of the belief; taken for the paper's epochs (Table 3)"""
     batch_episodes: int = 256
     """whole episodes per update of the belief"""
     belief_lr: float = 3e-4
@@ -111,7 +111,7 @@ class Args:
     bptt_steps: int | None = None
     """cut back-propagation through time after this many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
-    """subtract the dataset's mean image and divide by what varies, or just divide by 255"""
+    """subtract the dataset's mean image and divide by the std of what is left, one number; or divide by 255"""
     chrono_init: bool = True
     """GRU gates that start out remembering for up to an episode (Tallec and Ollivier, 2018)"""
     gru_layers: int = 1
@@ -257,7 +257,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has the actions too; here only the joints, which the actions move.
+    The paper's history (E.2) has past actions, too; with them h_{t+1} would hold a_t, for the action head to copy.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -284,8 +284,8 @@ class HistoryEncoder(nn.Module):
 
 
 def chrono_init(gru: nn.GRU, steps: int) -> None:
-    """Let the GRU start out remembering for 2 to steps steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
-    gate = slice(gru.hidden_size, 2 * gru.hidden_size)  # torch orders the gates reset, update, new
+    """Let the GRU begin with time constants of 2 to steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
+    gate = slice(gru.hidden_size, 2 * gru.hidden_size)  # after the reset gate; h' = (1 - gate) n + gate h
     for layer in range(gru.num_layers):
         with torch.no_grad():
             getattr(gru, f"bias_ih_l{layer}")[gate] = torch.empty(gru.hidden_size).uniform_(1, steps - 1).log()
@@ -369,7 +369,10 @@ def believer_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) 
 
 
 def compute_gae(rewards: Tensor, values: Tensor, gamma: float, gae_lambda: float) -> Tensor:
-    """Generalised advantages (T, N) of whole episodes: rewards (T, N), values (T+1, N) with V(o_T) as the last."""
+    """Generalised advantages (T, N) of whole episodes: rewards (T, N), values (T+1, N) with V(o_T) as the last.
+
+    No done flags: a success ends no episode, and the time limit is a truncation, so V(o_T) is bootstrapped.
+    """
     advantages, last = torch.empty_like(rewards), torch.zeros_like(rewards[0])
     deltas = rewards + gamma * values[1:] - values[:-1]
     for t in reversed(range(len(rewards))):
@@ -450,7 +453,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Gaussian noise of shape (..., T), N(0, 1) at every step, spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    """Gaussian noise of shape (..., T), spectrum 1/f**beta over time (Eberhard et al., 2023), each step N(0, 1.00)."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
     return noise * np.sqrt(power[1:].sum() / power.sum())  # the package leaves f = 0 out when it scales the std to 1
@@ -479,12 +482,12 @@ def rollout(
         u_noise.zero_()
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     rounds = range(0, num_episodes, envs.num_envs)
-    name = "evaluation" if deterministic else "rollout"
-    bar = tqdm(total=len(rounds) * steps, desc=name, unit="step", unit_scale=envs.num_envs, leave=False)
+    desc = "evaluation" if deterministic else "rollout"
+    bar = tqdm(total=len(rounds) * steps, desc=desc, unit="step", unit_scale=envs.num_envs, leave=False)
     for first in rounds:
-        # the last round is filled up with repeated episodes; new are those to keep
+        # the last round is filled up with repeated episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
-        new = rows[: num_episodes - first]
+        kept = rows[: num_episodes - first]
         obs, info = envs.reset(seed=seeds[rows].tolist())
         hidden = None
         for t in range(steps + 1):
@@ -494,7 +497,7 @@ def rollout(
             p_u = agent.belief.decode(h[0], z_noise[t, rows])
             step["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
             dist, values = agent(step)
-            buffer["values"][t, new] = values[: len(new)]
+            buffer["values"][t, kept] = values[: len(kept)]
             if t == steps:
                 break  # the last observation is only for its value
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
@@ -507,7 +510,7 @@ def rollout(
             for name, x in step.items():
                 if name not in buffer:
                     buffer[name] = torch.empty(steps, num_episodes, *x.shape[1:], dtype=x.dtype, device=device)
-                buffer[name][t, new] = x[: len(new)]
+                buffer[name][t, kept] = x[: len(kept)]
             bar.update()
     bar.close()
     return buffer
@@ -559,8 +562,8 @@ def evaluate(
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    u_r2, u_r2_at_end: what the belief knows where its agent takes it, R2 of u = phi(s) from the mean particle, over all
-    steps and at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
+    u_r2, u_r2_at_end: R2 of u = phi(s) from the mean particle in the states that this agent visits, over all steps and
+    at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
     """
     torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
@@ -615,7 +618,7 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
         losses = believer_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # one outlier can undo the memory
+        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # or one bad batch makes it forget
         optimizer.step()
         if update % 10 == 0:
             for name, value in losses.items():
@@ -706,7 +709,7 @@ def main(args: Args) -> None:
         buffer["advantages"] = compute_gae(buffer["rewards"], values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
-        stepped = []  # the losses of the minibatches that were stepped on
+        applied = []  # losses of the minibatches that led to an optimizer step
         for _ in range(args.update_epochs):
             for mb_inds in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
                 losses = ppo_losses(agent, {name: x[mb_inds] for name, x in batch.items()}, args)
@@ -716,13 +719,13 @@ def main(args: Args) -> None:
                 losses["total"].backward()
                 nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
                 optimizer.step()
-                stepped.append({name: x.detach() for name, x in losses.items()})
+                applied.append({name: x.detach() for name, x in losses.items()})
             if losses["approx_kl"] > args.target_kl:
                 break
         for name in losses:
-            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in stepped or [losses]]).mean().item()
-        explained = 1 - batch["advantages"].var() / batch["returns"].var()  # of returns - values, the advantages
-        scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(stepped)}
+            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
+        explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
+        scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
         del buffer, batch, losses  # a gigabyte of images, before the evaluation has its own
@@ -760,7 +763,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
     """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), the cue and all else that is hidden.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all task facts, the cue too.
     """
 
     def __init__(self, env: gym.Env):
@@ -778,7 +781,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
-        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()
+        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()  # a copy; the next is drawn over it
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
@@ -841,7 +844,7 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
             for part in shape.parts:
                 mesh = trimesh.Trimesh(part.vertices, part.triangles, process=False)
                 if len(mesh.faces) > triangles:
-                    mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files no two triangles share any
+                    mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files triangles share none
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
                 arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))

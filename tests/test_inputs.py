@@ -294,10 +294,12 @@ def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.Cap
     train(ppo_aib, **PPO, num_episodes=20)
     change(Path(f"runs/{TOY}__ppo_aib__1/checkpoint.pt"), iteration=0)()
     weights = torch.load(BELIEF_PT, weights_only=True)["belief"]
-    change(BELIEF_PT, belief={name: 1.01 * x for name, x in weights.items()})()
-    with pytest.raises(SystemExit) as stop:
-        train(ppo_aib, **PPO, num_episodes=20)
-    refused((stop.value.code, *capfd.readouterr()), "began with another belief", "--overwrite")
+    retrained = {name: 1.01 * x for name, x in weights.items()}
+    for other in (retrained, weights | {"history.gru.weight_ih_l1": torch.zeros(768, 256)}):  # two GRU layers
+        change(BELIEF_PT, belief=other)()
+        with pytest.raises(SystemExit) as stop:
+            train(ppo_aib, **PPO, num_episodes=20)
+        refused((stop.value.code, *capfd.readouterr()), "began with another belief", "--overwrite")
     BELIEF_PT.unlink()
     change(REPR_PT, seed=2)()
     with pytest.raises(SystemExit) as stop:

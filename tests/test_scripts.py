@@ -14,11 +14,11 @@ TREES = {name: ast.parse(source) for name, source in SOURCES.items()}
 SECTIONS = ["arguments", "networks", "losses", "data", "evaluation", "training", "simulator", "files and stages"]
 OWN = ("Args", "main", "evaluate_checkpoint", "SMALL", "QUICK", "LIMITS", "MAY_DIFFER", "TASKS")
 BUDGET = {  # a reader's: tokens of code, lines
-    "aib_repr": (5938, 674),
-    "aib_belief": (5882, 659),
-    "ppo_aib": (7319, 844),
-    "ppo_believer": (9315, 1037),
-    "ppo_baseline": (5789, 677),
+    "aib_repr": (5938, 675),
+    "aib_belief": (5882, 661),
+    "ppo_aib": (7328, 847),
+    "ppo_believer": (9315, 1040),
+    "ppo_baseline": (5789, 680),
 }
 
 
