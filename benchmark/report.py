@@ -123,7 +123,7 @@ def by_seed(rows: list[dict], column: str, **chosen: str) -> dict[str, tuple[np.
     for row in rows:
         if all(row[name] == value for name, value in chosen.items()) and row.get(column):
             found[row["seed"]].append((float(row["step"] or 0), float(row[column])))
-    return {seed: tuple(np.array(sorted(pairs)).T) for seed, pairs in found.items()}
+    return {seed: tuple(np.array(sorted(pairs)).T) for seed, pairs in sorted(found.items())}
 
 
 def last_three(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[float]:
@@ -132,11 +132,11 @@ def last_three(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[float]:
 
 
 def summarise(values: list[float]) -> str:
-    """Mean (seeds, sorted); from five on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
+    """Mean (each seed); from five on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
     if len(values) < 2:
         return "".join(f"{value:.2f}" for value in values)
     if len(values) < 5:
-        return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in sorted(values))})"
+        return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in values)})"
     low, high = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} [{low:.2f}, {high:.2f}]"
 
@@ -204,13 +204,13 @@ def beliefs_table(beliefs: list[dict]) -> str:
 def heads_table(beliefs: list[dict]) -> str:
     """The action heads and Believer on the same episodes and u."""
     rows = []
-    for task in ("RememberShapeAndColor3x2-v0", "InterceptFast-v0"):
+    for task, setting in rows_of("heads"):
         for method in HEADS.values():
             cells = []
             for metric in ("cue_from_particle", "u_r2_prior", "nll_prior", "action_readout"):
-                cells.append(belief_cell(beliefs, task, method, HEAD_SETTING, metric, from_step=30))
-            rows.append([task.removesuffix("-v0"), method, *cells])
-    head = ["task", "head", "cue from particles", "R² of u", "−log p(u), prior", "R² of a_t"]
+                cells.append(belief_cell(beliefs, task, method, setting, metric, from_step=30))
+            rows.append([task.removesuffix("-v0"), setting, method, *cells])
+    head = ["task", "setting", "head", "cue from particles", "R² of u", "−log p(u), prior", "R² of a_t"]
     return markdown(head, rows)
 
 
