@@ -376,17 +376,17 @@ def main(args: Args) -> None:
     model = nn.ModuleDict({"phi": phi, "psi": psi, "g": g}).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     train_inds, val_inds = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
-    per_epoch, first = math.ceil(len(train_inds) / args.batch_size), 0
+    per_epoch, completed = math.ceil(len(train_inds) / args.batch_size), 0
     if (path / "checkpoint.pt").exists():
         checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first = checkpoint["epoch"]
-        print(f"resuming {path} at epoch {first}", flush=True)
-    writer = SummaryWriter(path, purge_step=first * per_epoch + 1)
-    bar = tqdm(total=args.epochs * per_epoch, initial=first * per_epoch, desc="phi", unit="update")
+        completed = checkpoint["epoch"]
+        print(f"resuming {path} at epoch {completed}", flush=True)
+    writer = SummaryWriter(path, purge_step=completed * per_epoch + 1)
+    bar = tqdm(total=args.epochs * per_epoch, initial=completed * per_epoch, desc="phi", unit="update")
 
-    for epoch in range(first, args.epochs):
+    for epoch in range(completed, args.epochs):
         torch.manual_seed(args.seed * 1_000_000 + epoch)  # so that a resumed run repeats the epoch
         order = np.random.default_rng([args.seed, epoch]).permutation(train_inds)
         for index in np.array_split(order, per_epoch):
@@ -417,6 +417,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
+# the same in every script
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -578,6 +579,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
+# the same in every script
 
 
 def fail(message: str) -> NoReturn:

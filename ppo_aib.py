@@ -564,6 +564,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
+# the same in every script
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -725,6 +726,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
+# the same in every script
 
 
 def fail(message: str) -> NoReturn:

@@ -338,9 +338,9 @@ class Agent(nn.Module):
 
 
 def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int | None = None) -> Tensor:
-    """h (T, B, 256) of whole episodes: rgb (T, B, H, W, 3) uint8, joints (T, B, J).
+    """h (T+1, B, 256) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J).
 
-    All T * B frames go through the CNN at once, or, where they are more than CNN_CHUNK, in chunks with gradient
+    All frames go through the CNN at once, or, where they are more than CNN_CHUNK, in chunks with gradient
     checkpointing. bptt_steps truncates back-propagation through time.
     """
     frames = [batch[name].flatten(0, 1).split(CNN_CHUNK) for name in ("rgb", "joints")]
@@ -598,16 +598,17 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
         history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
     model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
-    first = 0
+    completed = 0
     if (path / "belief_checkpoint.pt").exists():
         hint = "start again with --overwrite"
         checkpoint = load(path / "belief_checkpoint.pt", hint, kind="checkpoint", repr_crc=stored["crc"])
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        first = checkpoint["update"]
-        print(f"resuming {path} at update {first}", flush=True)
-    writer = SummaryWriter(path / "belief_events", purge_step=first + 1)
-    bar = tqdm(range(first + 1, args.num_updates + 1), "belief", args.num_updates, initial=first, unit="update")
+        completed = checkpoint["update"]
+        print(f"resuming {path} at update {completed}", flush=True)
+    writer = SummaryWriter(path / "belief_events", purge_step=completed + 1)
+    updates = range(completed + 1, args.num_updates + 1)
+    bar = tqdm(updates, "belief", args.num_updates, initial=completed, unit="update")
 
     for update in bar:
         rng = np.random.default_rng([args.seed, update])
@@ -757,6 +758,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
+# the same in every script
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -918,6 +920,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
+# the same in every script
 
 
 def fail(message: str) -> NoReturn:

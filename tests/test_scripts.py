@@ -14,11 +14,11 @@ TREES = {name: ast.parse(source) for name, source in SOURCES.items()}
 SECTIONS = ["arguments", "networks", "losses", "data", "evaluation", "training", "simulator", "files and stages"]
 OWN = ("Args", "main", "evaluate_checkpoint", "SMALL", "QUICK", "LIMITS", "MAY_DIFFER", "TASKS")
 BUDGET = {  # a reader's: tokens of code, lines
-    "aib_repr": (5938, 675),
-    "aib_belief": (5882, 661),
-    "ppo_aib": (7328, 847),
-    "ppo_believer": (9315, 1040),
-    "ppo_baseline": (5789, 680),
+    "aib_repr": (5938, 677),
+    "aib_belief": (5885, 663),
+    "ppo_aib": (7328, 849),
+    "ppo_believer": (9318, 1043),
+    "ppo_baseline": (5789, 682),
 }
 
 
