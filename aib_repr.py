@@ -109,7 +109,7 @@ class Args:
     kl_reduction: Literal["sum", "mean"] = "sum"
     """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
     psi_images: bool = True
-    """psi sees image and joints, as in the paper; without images this stage takes a CPU minutes instead of an hour"""
+    """psi sees image and joints, as in the paper; without images a CPU is many times faster, and the belief worse"""
     amp: bool = BFLOAT16
     """image network in bfloat16"""
 
