@@ -103,7 +103,7 @@ class Args:
     obs_coef: float = 0.03
     """lambda_o"""
     kl_coef: float = 0.01
-    """lambda_KL; 0.03, the paper's, can drop the cue from u; with 0.003 u encodes the target differently per cue"""
+    """lambda_KL; 0.03, the paper's, can drop the cue from u"""
     reward_norm: bool = True
     """standardise rewards; without it the reward term of a random policy is next to nothing"""
     kl_reduction: Literal["sum", "mean"] = "sum"
