@@ -39,7 +39,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
+FORMAT = 7  # of every .pt file and of dataset/; load refuses any other
 CNN_CHUNK = 2048  # images through a belief's CNN at a time; their activations take 1 to 2 GB
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively

@@ -55,7 +55,7 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 6  # of every .pt file and of dataset/; load refuses any other
+FORMAT = 7  # of every .pt file and of dataset/; load refuses any other
 CNN_CHUNK = 2048  # images through a belief's CNN at a time; their activations take 1 to 2 GB
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
@@ -161,6 +161,8 @@ class Args:
     """standard deviation of the actions at the start"""
     noise_beta: float = 0.0
     """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, the paper's; 1 is pink"""
+    joints_norm: bool = False
+    """standardise the policy's joints by their running mean and standard deviation"""
     amp: bool = False
     """image networks of policy and belief in bfloat16"""
     evaluate: bool = False
@@ -178,7 +180,8 @@ TASKS = {  # Table 5; all other tasks get the defaults above, which are Intercep
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
 SMALL = dict(exp_name="ppo_believer_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
-SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, eval_every=15, num_eval_episodes=64)
+SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, joints_norm=True)
+SMALL |= dict(eval_every=15, num_eval_episodes=64)
 SMALL |= dict(amp=BFLOAT16, num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
 QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
@@ -318,6 +321,7 @@ class Agent(nn.Module):
         spaces, (action_dim,) = envs.single_observation_space, envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
+        self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
         self.w_agg = orthogonal_init(mlp([64, 64, 64]))
@@ -328,8 +332,10 @@ class Agent(nn.Module):
 
     def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
         """rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u_dim) -> Normal over actions (B, A), value (B,)."""
+        image = self.cnn(obs["rgb"].float().div_(255))
+        joints = self.joints(self.joints_norm(obs["joints"]))
         belief = self.w_agg(self.w_enc(obs["particles"]).mean(-2))
-        x = torch.cat([self.cnn(obs["rgb"].float().div_(255)), self.joints(obs["joints"]), belief], -1)
+        x = torch.cat([image, joints, belief], -1)
         mean = torch.tanh(self.actor(x))  # within the box of actions
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
 
@@ -729,6 +735,9 @@ def main(args: Args) -> None:
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
+        if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
+            agent.joints_norm.train()(batch["joints"])
+            agent.joints_norm.eval()
         del buffer, batch, losses  # a gigabyte of images, before the evaluation has its own
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:

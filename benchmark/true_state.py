@@ -72,6 +72,7 @@ class StateAgent(nn.Module):
         (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
         self.phi = phi
         input_dim = 25 + phi(phi.mean).mean.numel() if phi else joints_dim
+        self.joints_norm = nn.BatchNorm1d(joints_dim, affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(input_dim, 256 + 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
         self.critic = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, 1)))
@@ -80,9 +81,9 @@ class StateAgent(nn.Module):
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of joints (B, 25 + D)."""
-        x = obs["joints"]
+        x = self.joints_norm(obs["joints"])
         if self.phi:
-            x = torch.cat([x[:, :25], self.phi(x[:, 25:]).mean], -1)
+            x = torch.cat([x[:, :25], self.phi(obs["joints"][:, 25:]).mean], -1)
         x = self.joints(x)
         mean = torch.tanh(self.actor(x))
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
