@@ -86,6 +86,8 @@ class Args:
     """whole episodes per update of the belief"""
     belief_lr: float = 3e-4
     """Adam's learning rate for the belief"""
+    belief_anneal: bool = False
+    """let that learning rate fall linearly to 0 over the second half of the updates"""
     z_dim: int = 32
     """size of z"""
     beta: float = 1.0
@@ -119,7 +121,7 @@ LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_shift=(0,
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
-SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
+SMALL |= dict(belief_anneal=True, repr_dir="runs/{env_id}__aib_repr_small__{seed}")
 QUICK = dict(exp_name="aib_belief_quick", num_episodes=8, num_updates=4, batch_episodes=4)
 QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 
@@ -508,6 +510,8 @@ def main(args: Args) -> None:
         if args.image_shift:
             shift_images(batch["rgb"], args.image_shift, rng)
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
+        if args.belief_anneal:
+            optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - (update - 1) / args.num_updates))
         losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()

@@ -104,6 +104,8 @@ class Args:
     """whole episodes per update of the belief"""
     belief_lr: float = 3e-4
     """Adam's learning rate for the belief"""
+    belief_anneal: bool = False
+    """let that learning rate fall linearly to 0 over the second half of the updates"""
     z_dim: int = 32
     """size of z"""
     beta: float = 1.0
@@ -183,7 +185,7 @@ SMALL = dict(exp_name="ppo_believer_small", total_timesteps=120_000, num_envs=16
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, joints_norm=True)
 SMALL |= dict(eval_every=15, num_eval_episodes=64)
 SMALL |= dict(amp=BFLOAT16, num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
-SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
+SMALL |= dict(belief_anneal=True, repr_dir="runs/{env_id}__aib_repr_small__{seed}")
 QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
 QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_episodes=8, num_updates=4, batch_episodes=4)
 
@@ -622,6 +624,8 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
         if args.image_shift:
             shift_images(batch["rgb"], args.image_shift, rng)
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
+        if args.belief_anneal:
+            optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - (update - 1) / args.num_updates))
         losses = believer_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()

@@ -70,6 +70,34 @@ def test_particles_are_draws_from_prior_and_decoder(toy_stages: Path) -> None:
         assert torch.allclose(data["particles"][:, :, i], d.mean + d.stddev * u_noise[:10, :, i], atol=1e-4)
 
 
+@pytest.mark.parametrize("script", METHODS)
+def test_joints_are_standardised_by_the_iterations_played_so_far(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    module, played, first_kl = SCRIPTS[script], [], []
+    rollout, ppo_losses = module.rollout, module.ppo_losses
+
+    def noted_rollout(*args: object, deterministic: bool = False) -> dict:
+        data = rollout(*args, deterministic=deterministic)
+        if not deterministic:
+            played.append(data["joints"].flatten(0, 1))
+        return data
+
+    def noted_losses(*args: object) -> dict:
+        losses = ppo_losses(*args)
+        if len(first_kl) < len(played):
+            first_kl.append(losses["approx_kl"].item())
+        return losses
+
+    monkeypatch.setattr(module, "rollout", noted_rollout)
+    monkeypatch.setattr(module, "ppo_losses", noted_losses)
+    path = train(module, **small(module, toy_stages, joints_norm=True))
+    stored = torch.load(path / "agent.pt", weights_only=True)["agent"]
+    mean = torch.stack([joints.mean(0) for joints in played]).mean(0)
+    assert len(played) == 2 and torch.allclose(stored["joints_norm.running_mean"], mean, atol=1e-5)
+    assert max(first_kl) < 1e-6, "statistics change between iterations, not within"
+
+
 def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path) -> None:
     agent, data = play(toy_stages)
     batch = {name: x[:10].flatten(0, 1) for name, x in data.items()}
@@ -354,7 +382,16 @@ def test_table_5(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
 
 
 def test_small_settings_are_the_same_for_all_three_methods() -> None:
-    own = {"exp_name", "belief", "repr_dir", "num_episodes", "num_updates", "batch_episodes", "belief_lr"}
+    own = {
+        "exp_name",
+        "belief",
+        "repr_dir",
+        "num_episodes",
+        "num_updates",
+        "batch_episodes",
+        "belief_lr",
+        "belief_anneal",
+    }
     first, *others = ({name: x for name, x in SCRIPTS[s].SMALL.items() if name not in own} for s in METHODS)
     assert first["total_timesteps"] >= 100_000 and all(first == other for other in others)
     stage_2 = {name: x for name, x in aib_belief.SMALL.items() if name != "exp_name"}
