@@ -382,16 +382,7 @@ def test_table_5(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
 
 
 def test_small_settings_are_the_same_for_all_three_methods() -> None:
-    own = {
-        "exp_name",
-        "belief",
-        "repr_dir",
-        "num_episodes",
-        "num_updates",
-        "batch_episodes",
-        "belief_lr",
-        "belief_anneal",
-    }
+    own = {"exp_name", "belief", "repr_dir", "num_episodes", "num_updates", "batch_episodes", "belief_lr"}
     first, *others = ({name: x for name, x in SCRIPTS[s].SMALL.items() if name not in own} for s in METHODS)
     assert first["total_timesteps"] >= 100_000 and all(first == other for other in others)
     stage_2 = {name: x for name, x in aib_belief.SMALL.items() if name != "exp_name"}
