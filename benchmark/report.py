@@ -252,10 +252,10 @@ def known_table(beliefs: list[dict]) -> str:
     rows = []
     for task, setting in sorted({(row["task"], row["setting"]) for row in beliefs if row["metric"] == "u_r2_agent"}):
         cells = []
-        for metric in ("u_r2_random", "error_cm_random", "u_r2_agent", "error_cm_agent"):
+        for metric in ("u_r2_random", "error_cm_random", "u_r2_agent", "error_cm_agent", "u_r2_unpushed"):
             cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
         rows.append([task.removesuffix("-v0"), setting, *cells])
-    head = ["task", "belief", "R² of u, random", "error, cm", "R² of u, agent", "error, cm"]
+    head = ["task", "belief", "R² of u, random", "error, cm", "R² of u, agent", "error, cm", "R² of u, unpushed"]
     return markdown(head, rows)
 
 

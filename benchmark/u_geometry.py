@@ -6,7 +6,8 @@ and their products; then the error with which the position is a linear function 
 
 With --belief, on a dataset of refresh.py, instead what a belief knows on held-out scenes, played by the random policy
 and by the agent: R2 of u from its mean particle, and the median error of the target position as read from it by a
-linear function of u.
+linear function of u. An agent pushes its target, which no random episode shows: u_r2_unpushed compares its particles
+with u where the random policy left the target, pushed_cm is how far off that is (median).
 
 Usage:   python benchmark/u_geometry.py --repr-dir runs/RememberColor5-v0__aib_repr_small__1
          python benchmark/u_geometry.py --repr-dir runs/RememberColor3-v0__aib_repr_refreshed__1 \
@@ -92,6 +93,12 @@ def shift(args: Args, states: torch.Tensor, cue_dim: int, num_val: int) -> dict[
             report[t, f"u_r2_{name}"] = 1 - (residual / (u[rows, t] - u[rows, t].mean(0)).square().sum()).item()
             error = np.linalg.norm(probe.predict(particle[:, t]) - target[rows, t].numpy(), axis=1)
             report[t, f"error_cm_{name}"] = 100 * np.median(error)
+            if name == "agent":  # the row before is the random policy's in the same scene, where nothing is pushed
+                unpushed = u[rows - 1, t]
+                residual = (particle[:, t] - unpushed).square().sum()
+                report[t, "u_r2_unpushed"] = 1 - (residual / (unpushed - unpushed.mean(0)).square().sum()).item()
+                pushed = (target[rows, t] - target[rows - 1, t]).norm(dim=-1)
+                report[t, "pushed_cm"] = 100 * pushed.median().item()
     return report
 
 
