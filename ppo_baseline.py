@@ -83,7 +83,7 @@ class Args:
     """delete what the run directory holds and start again; to resume, leave it out"""
 
     total_timesteps: int = 10_000_000
-    """environment steps of training"""
+    """environment steps of training; a finished run goes on with a larger number"""
     num_envs: int = 256
     """episodes per iteration; on physx_cuda one arm pose is drawn for all of them"""
     learning_rate: float = 1e-4
@@ -127,7 +127,7 @@ class Args:
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
 LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf))
-MAY_DIFFER = ("overwrite", "num_workers", "evaluate", "checkpoint")  # when a run is resumed
+MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "evaluate", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
@@ -345,8 +345,8 @@ def main(args: Args) -> None:
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
     checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
-    if checkpoint.get("iteration") == num_iterations:
-        print(f"{path} is finished; --overwrite recreates it")
+    if checkpoint.get("iteration", 0) >= num_iterations:
+        print(f"{path} is finished; --overwrite recreates it, a larger --total-timesteps continues it")
         return
     open_run(path, args)
 

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import shutil
 import sys
 import weakref
 from pathlib import Path
@@ -340,6 +341,22 @@ def test_any_number_of_workers_gives_the_same_training_and_evaluation(
         for row, other_row in zip(one[1], other[1], strict=True):
             assert row.keys() == other_row.keys()
             assert all(float(row[name]) == pytest.approx(float(other_row[name]), abs=1e-4) for name in row)
+
+
+@pytest.mark.parametrize("script", METHODS)
+def test_a_finished_run_goes_on_as_if_it_had_been_long_from_the_start(
+    toy_task: Path, toy_stages: Path, script: str
+) -> None:
+    arguments = small(SCRIPTS[script], toy_stages)
+    longer = train(SCRIPTS[script], **{**arguments, "total_timesteps": 80, "exp_name": "longer"})
+    shutil.copytree(longer, "copy")  # this process still holds the lock of the old folder
+    shutil.rmtree(longer)
+    Path("copy").rename(longer)
+    train(SCRIPTS[script], **{**arguments, "exp_name": "longer"})
+    whole = train(SCRIPTS[script], **{**arguments, "exp_name": "whole"})
+    assert (longer / "eval.csv").read_text() == (whole / "eval.csv").read_text()
+    agents = [torch.load(path / "agent.pt", weights_only=True)["agent"] for path in (longer, whole)]
+    assert all(torch.equal(x, y) for x, y in zip(agents[0].values(), agents[1].values(), strict=True))
 
 
 def test_evaluate_takes_over_what_the_episodes_depend_on(toy_task: Path, monkeypatch: pytest.MonkeyPatch) -> None:
