@@ -64,9 +64,9 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """with or without a camera at its wrist, whose image is never used"""
+    """MIKASA-Robo's has a camera at its wrist, whose image is never used; panda has none"""
     robot_triangles: int = 0 if CUDA else 500
-    """decimate robot meshes to about so many, the ground to two; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -247,7 +247,7 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # no loss has it
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss: it stays as loaded
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
@@ -371,7 +371,11 @@ def erase_images(rgb: Tensor, count: int, rng: np.random.Generator) -> None:
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    default = QUICK["repr_dir"] if args.quick else SMALL["repr_dir"] if args.small else Args.repr_dir
+    default = Args.repr_dir
+    if args.small:
+        default = SMALL["repr_dir"]
+    if args.quick:
+        default = QUICK["repr_dir"]
     if args.repr_dir == default and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
@@ -534,7 +538,8 @@ def main(args: Args) -> None:
         losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)  # or one bad batch makes it forget
+        # one bad batch can erase what h remembers
+        nn.utils.clip_grad_norm_(model.parameters(), 10.0, error_if_nonfinite=True)
         optimizer.step()
         if update % 10 == 0:
             for name, value in losses.items():
@@ -551,7 +556,7 @@ def main(args: Args) -> None:
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
 
-    # no early stopping: held-out error and likelihood are best before the cue can be read from h
+    # no early stopping: held-out error and likelihood are best before h holds the cue
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = probe_belief(fit, test)
     if args.action_head == "flow":

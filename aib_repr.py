@@ -68,9 +68,9 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """with or without a camera at its wrist, whose image is never used"""
+    """MIKASA-Robo's has a camera at its wrist, whose image is never used; panda has none"""
     robot_triangles: int = 0 if CUDA else 500
-    """decimate robot meshes to about so many, the ground to two; 500: a CPU steps 10 times as fast; 0: untouched"""
+    """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -252,10 +252,12 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> d
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Gaussian noise of shape (..., T), spectrum 1/f**beta over time (Eberhard et al., 2023), each step N(0, 1.00)."""
+    """Noise of shape (..., T), N(0, 1) at each step, with spectrum 1/f**beta over time (Eberhard et al., 2023)."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
-    power = np.abs(np.fft.fftfreq(shape[-1])).clip(1 / shape[-1]) ** -beta
-    return noise * np.sqrt(power[1:].sum() / power.sum())  # the package leaves f = 0 out when it scales the std to 1
+    # the package scales it to a standard deviation of 1 as if there were no power at f = 0: scale it down by that
+    frequencies = np.abs(np.fft.fftfreq(shape[-1]))
+    power = frequencies.clip(1 / shape[-1]) ** -beta
+    return noise * np.sqrt(power[1:].sum() / power.sum())
 
 
 def random_actions(args: Args, episode: int, steps: int, action_dim: int) -> np.ndarray:
@@ -296,7 +298,7 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
                 buffer[name].append(torch.as_tensor(x))
             bar.update(envs.num_envs)
         buffer = {name: torch.stack(xs, 1) for name, xs in buffer.items()}
-        buffer |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue)}
+        buffer |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue).reshape(len(rows), -1)}
         if not arrays:
             size = buffer["rgb"][0].nbytes * count
             if size > shutil.disk_usage(path.parent).free:
@@ -424,12 +426,15 @@ class PrivilegedInfoWrapper(gym.Wrapper):
     """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all task facts, the cue too.
+    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all that the task's _get_obs_extra
+    returns but the tool's pose; in MIKASA's tasks the cue is in it.
     """
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
-        self.task, self.poses, task_evaluate = env.unwrapped, {}, env.unwrapped.evaluate
+        self.task = env.unwrapped
+        self.poses = {}
+        task_evaluate = self.task.evaluate
 
         def evaluate_and_note_poses() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
@@ -439,7 +444,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         # the next physics step moves them back by itself.
         if not self.task.gpu_sim_enabled:
             self.task.evaluate = evaluate_and_note_poses
-        self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))
+        self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))  # pictures belong to it now
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
         rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()  # a copy; the next is drawn over it
@@ -462,9 +467,12 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
+# the next three only make a CPU faster
+
+
 @contextmanager
 def shaders_without_brdf_table() -> Iterator[None]:
-    """Spare SAPIEN the table of a sky's reflections, most of a simulator's start on a CPU: there is no sky."""
+    """Start SAPIEN without its table for reflections of a sky, most of the start on a CPU: these tasks have no sky."""
     set_shader_dir = sapien.render.set_camera_shader_dir
     with tempfile.TemporaryDirectory() as folder:
         pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
@@ -494,7 +502,7 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
     """Draw the robot with about so many triangles per mesh and the ground with two; objects are drawn as they are.
 
     The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground has
-    20,000, between 101 x 101 vertices in a plane: its corners draw the same picture.
+    20,000, between a square of vertices in a plane: its corners draw the same picture.
     """
     for link in task.agent.robot.get_links():
         entities, meshes = [body.entity for body in link._objs], []  # one per scene
@@ -513,10 +521,10 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
         replace_meshes(entities, meshes)
     ground = task.scene.actors["ground"]._objs
     part = ground[0].find_component_by_type(RenderBodyComponent).render_shapes[0].parts[0]
-    vertices, normals, uvs = (
-        x[[0, 100, -101, -1]] for x in (part.vertices, part.get_vertex_normal(), part.get_vertex_uv())
-    )
-    replace_meshes(ground, [(sapien.Pose(), vertices, [[0, 2, 3], [0, 3, 1]], normals, uvs, part.material)])
+    width = math.isqrt(len(part.vertices))
+    corners = [0, width - 1, -width, -1]
+    arrays = part.vertices[corners], [[0, 2, 3], [0, 3, 1]], part.get_vertex_normal()[corners]
+    replace_meshes(ground, [(sapien.Pose(), *arrays, part.get_vertex_uv()[corners], part.material)])
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:

@@ -38,7 +38,7 @@ class ToyMemory(gym.vector.VectorEnv):
         one_hot = np.eye(3, dtype=np.float32)[self.colour]
         success = np.abs(self.action[:, None] - self.TARGETS).argmin(1) == self.colour
         info = {"success": (success & (self.t == self.STEPS)).astype(np.float32)}
-        info |= {"state": np.concatenate([one_hot, phase], 1), "cue": self.colour[:, None].astype(np.float32)}
+        info |= {"state": np.concatenate([one_hot, phase], 1), "cue": self.colour.astype(np.float32)}  # a number
         return obs, info
 
     def reset(self, *, seed: list[int], options: dict | None = None) -> tuple[dict, dict]:

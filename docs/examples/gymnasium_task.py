@@ -67,7 +67,10 @@ gym.register(TASK, RememberTarget, max_episode_steps=20)
 
 
 def make_envs(args: object) -> gym.vector.VectorEnv:
-    """In place of the scripts' make_envs. For a slow simulator: "async", with fewer."""
+    """In place of the scripts' make_envs. A slow simulator is better off in processes of its own:
+
+    gym.make_vec(TASK, args.num_workers, "async", vector_kwargs={"autoreset_mode": "Disabled", "context": "spawn"})
+    """
     return gym.make_vec(TASK, args.num_envs, "sync", vector_kwargs={"autoreset_mode": "Disabled"})
 
 
