@@ -2,7 +2,7 @@
 
 Usage:   python benchmark/report.py                                  (README.md, docs/results.md and their figures)
          python benchmark/report.py --runs runs                      (learning curves and last values of your runs)
-         python benchmark/report.py --runs runs --add "coloured noise"   (append your runs to eval.csv, beliefs.csv)
+         python benchmark/report.py --runs runs --add "--small"          (append your runs to eval.csv, beliefs.csv)
 Reads:   benchmark/results/: eval.csv, beliefs.csv, paper.csv, tables.csv (which rows tables show, in order);
          or runs/*/: args.json with eval.csv, diagnostics.json
 Writes:  tables between <!-- name --> and <!-- end --> in the pages, PNG figures; or benchmark/report/
@@ -168,25 +168,29 @@ def results_table(evals: list[dict]) -> str:
 
 
 def agents_table(evals: list[dict]) -> str:
-    """All agents with pictures: success_once and success_at_end."""
+    """Agents with pictures: success_once and success_at_end."""
     rows = []
     repr_arguments = {row["setting"]: row["aib_repr"] for row in read("settings.csv")}
-    for task, method, setting in sorted({(row["task"], row["method"], row["setting"]) for row in evals}):
-        if method in METHODS.values():
+    for task, setting in rows_of("agents"):
+        for method in METHODS.values():
             chosen = {"task": task, "method": method, "setting": setting}
-            steps = min(curve[0][-1] for curve in by_seed(evals, "success_once", **chosen).values())
+            curves = by_seed(evals, "success_once", **chosen)
+            if not curves:
+                continue
+            steps = min(curve[0][-1] for curve in curves.values())
             episodes = re.search(r"--num-episodes (\d+)", repr_arguments[setting])
             length = 90 if task.startswith("Intercept") else 60
             random_steps = length * int(episodes[1] if episodes else 640) if method != "PPO" else 0
             cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
-            rows.append([task.removesuffix("-v0"), method, setting, f"{random_steps:,}", f"{steps:,.0f}", *cells])
-    return markdown(["task", "method", "setting", "random steps", "PPO steps", *METRICS[:2]], rows)
+            run = [setting, ", ".join(curves), f"{random_steps:,}", f"{steps:,.0f}"]
+            rows.append([task.removesuffix("-v0"), method, *run, *cells])
+    return markdown(["task", "method", "setting", "seeds", "random steps", "PPO steps", *METRICS[:2]], rows)
 
 
-def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str, from_step: int = 999) -> str:
-    """A metric at the last time step, or its mean from a time step on."""
+def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str) -> str:
+    """A metric at the last time step, of each seed."""
     curves = by_seed(beliefs, "value", task=task, method=method, setting=setting, metric=metric)
-    return summarise([values[steps >= min(from_step, steps[-1])].mean() for steps, values in curves.values()])
+    return summarise([values[-1] for _, values in curves.values()])
 
 
 def beliefs_table(beliefs: list[dict]) -> str:
@@ -207,10 +211,11 @@ def heads_table(beliefs: list[dict]) -> str:
     for task, setting in rows_of("heads"):
         for method in HEADS.values():
             cells = []
-            for metric in ("cue_from_particle", "u_r2_prior", "nll_prior", "action_readout"):
-                cells.append(belief_cell(beliefs, task, method, setting, metric, from_step=30))
-            rows.append([task.removesuffix("-v0"), setting, method, *cells])
-    head = ["task", "setting", "head", "cue from particles", "R² of u", "−log p(u), prior", "R² of a_t"]
+            for metric in ("cue_from_particle", "u_r2_prior", "action_readout"):
+                cells.append(belief_cell(beliefs, task, method, setting, metric))
+            if any(cells):
+                rows.append([task.removesuffix("-v0"), setting, method, *cells])
+    head = ["task", "setting", "head", "cue from particles", "R² of u", "R² of a_t"]
     return markdown(head, rows)
 
 
@@ -220,55 +225,45 @@ def oracle_table(evals: list[dict]) -> str:
     The last evaluation until each step.
     """
     rows = []
-    for task, method, setting in sorted({(row["task"], row["method"], row["setting"]) for row in evals}):
-        if not method.startswith("oracle") or "learning_rate" in setting:
-            continue
-        curves = by_seed(evals, "success_once", task=task, method=method, setting=setting).values()
-        cells = []
-        for step in ORACLE_STEPS:
-            reached = [values[steps <= step][-1] for steps, values in curves if steps[-1] > 0.95 * step]
-            cells.append(", ".join(f"{value:.2f}" for value in reached))
-        rows.append([task.removesuffix("-v0"), method.removeprefix("oracle "), setting, *cells])
-    return markdown(["task", "the policy sees", "setting", *[f"{step:,}" for step in ORACLE_STEPS]], rows)
+    for task, setting in rows_of("oracle"):
+        for method in ORACLES.values():
+            curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
+            if not curves:
+                continue
+            cells = [setting, ", ".join(curves)]
+            for step in ORACLE_STEPS:
+                reached = [values[steps <= step][-1] for steps, values in curves.values() if steps[-1] > 0.95 * step]
+                cells.append(", ".join(f"{value:.2f}" for value in reached))
+            rows.append([task.removesuffix("-v0"), method.removeprefix("oracle "), *cells])
+    return markdown(["task", "the policy sees", "setting", "seeds", *[f"{step:,}" for step in ORACLE_STEPS]], rows)
 
 
 def shift_table(evals: list[dict]) -> str:
-    """Success, and R² of u at the last step, on the agent's own episodes: at the first, middle and last evaluation."""
+    """R² of u at the last step of the agents' own episodes: first evaluation, lowest, last; and success at the last."""
     rows = []
     runs = sorted({(row["task"], row["method"], row["setting"]) for row in evals if row["u_r2_at_end"]})
     for task, method, setting in runs:
         chosen = {"task": task, "method": method, "setting": setting}
-        known = by_seed(evals, "u_r2_at_end", **chosen)
-        for seed, (steps, success) in by_seed(evals, "success_once", **chosen).items():
-            cells = []
-            for i in (0, len(steps) // 2, -1):
-                cells += [f"{steps[i]:,.0f}", f"{success[i]:.2f}", f"{known[seed][1][i]:.2f}"]
-            rows.append([task.removesuffix("-v0"), method, setting, seed, *cells])
-    return markdown(["task", "method", "setting", "seed", *["steps", "success_once", "R² of u"] * 3], rows)
+        success = by_seed(evals, "success_once", **chosen)
+        for seed, (steps, known) in by_seed(evals, "u_r2_at_end", **chosen).items():
+            cells = [seed, f"{steps[-1]:,.0f}"]
+            cells += [f"{value:.2f}" for value in (known[0], known.min(), known[-1], success[seed][1][-1])]
+            rows.append([task.removesuffix("-v0"), method, setting, *cells])
+    head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, first", "lowest", "last", "success_once, last"]
+    return markdown(head, rows)
 
 
 def known_table(beliefs: list[dict]) -> str:
     """R² of u and error of the target position at the last step, on held-out random episodes and on an agent's."""
     rows = []
-    for task, setting in sorted({(row["task"], row["setting"]) for row in beliefs if row["metric"] == "u_r2_agent"}):
-        cells = []
-        for metric in ("u_r2_random", "error_cm_random", "u_r2_agent", "error_cm_agent", "u_r2_unpushed"):
-            cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
-        rows.append([task.removesuffix("-v0"), setting, *cells])
-    head = ["task", "belief", "R² of u, random", "error, cm", "R² of u, agent", "error, cm", "R² of u, unpushed"]
+    metrics = ("u_r2_random", "error_cm_random", "u_r2_agent", "error_cm_agent", "u_r2_unpushed")
+    for task, setting in rows_of("known"):
+        for seed in by_seed(beliefs, "value", task=task, setting=setting, metric="u_r2_agent"):
+            of_seed = [row for row in beliefs if row["seed"] == seed]
+            cells = [belief_cell(of_seed, task, "AIB", setting, metric) for metric in metrics]
+            rows.append([task.removesuffix("-v0"), setting, seed, *cells])
+    head = ["task", "belief", "seed", "R² of u, random", "error, cm", "R² of u, agent", "error, cm", "R² of unpushed u"]
     return markdown(head, rows)
-
-
-def phi_table(beliefs: list[dict]) -> str:
-    """How much of u's variance at the last step is linear in the target position, the cue, and their products."""
-    rows = []
-    for task, setting in sorted({(row["task"], row["setting"]) for row in beliefs if row["method"] == "phi"}):
-        cells = []
-        for metric in ("share_target", "share_cue", "share_target_x_cue", "target_error_cm"):
-            curves = by_seed(beliefs, "value", task=task, setting=setting, metric=metric)
-            cells.append(f"{curves['1'][1][-1]:.2f}")
-        rows.append([task.removesuffix("-v0"), setting, *cells])
-    return markdown(["task", "stage 1", "position", "cue", "position × cue", "error of the position, cm"], rows)
 
 
 # ---------------------------------------------------------------- figures
@@ -354,7 +349,7 @@ def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
     evals, beliefs = read("eval.csv"), read("beliefs.csv")
     tables = {"results": results_table(evals), "agents": agents_table(evals), "beliefs": beliefs_table(beliefs)}
-    tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "phi": phi_table(beliefs)}
+    tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals)}
     tables |= {"shift": shift_table(evals), "known": known_table(beliefs)}
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
