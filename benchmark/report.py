@@ -2,7 +2,7 @@
 
 Usage:   python benchmark/report.py                                  (README.md, docs/results.md and their figures)
          python benchmark/report.py --runs runs                      (learning curves and last values of your runs)
-         python benchmark/report.py --runs runs --add "--small"          (append your runs to eval.csv, beliefs.csv)
+         python benchmark/report.py --runs runs --add small              (append your runs to eval.csv, beliefs.csv)
 Reads:   benchmark/results/: eval.csv, beliefs.csv, paper.csv, tables.csv (which rows tables show, in order);
          or runs/*/: args.json with eval.csv, diagnostics.json
 Writes:  tables between <!-- name --> and <!-- end --> in the pages, PNG figures; or benchmark/report/
@@ -40,8 +40,8 @@ CHANCE = {  # one of so many objects is the right one
     "RememberColor9-v0": 1 / 9,
     "RememberShapeAndColor3x2-v0": 1 / 6,
 }
-HEAD_SETTING = "2000 episodes, 700 updates, stage-1 KL 0.003"
-ORACLE_STEPS = (28800, 57600, 86400, 144000, 240000)
+HEAD_SETTING = "2000 episodes, 700 updates, kl_coef 0.003"
+ORACLE_STEPS = (28800, 57600, 86400, 115200, 144000, 240000)
 
 
 @dataclass
@@ -262,7 +262,16 @@ def known_table(beliefs: list[dict]) -> str:
             of_seed = [row for row in beliefs if row["seed"] == seed]
             cells = [belief_cell(of_seed, task, "AIB", setting, metric) for metric in metrics]
             rows.append([task.removesuffix("-v0"), setting, seed, *cells])
-    head = ["task", "belief", "seed", "R² of u, random", "error, cm", "R² of u, agent", "error, cm", "R² of unpushed u"]
+    head = [
+        "task",
+        "belief",
+        "seed",
+        "R² of u, random",
+        "cm, random",
+        "R² of u, agent",
+        "cm, agent",
+        "R² of unpushed u",
+    ]
     return markdown(head, rows)
 
 
@@ -318,7 +327,7 @@ def learning_curves(evals: list[dict], path: Path) -> None:
 
 def belief_figure(beliefs: list[dict], path: Path) -> None:
     """Cue and R² of u from the mean particle by time step: action heads and Believer at the same setting."""
-    columns = [("RememberColor3-v0", "640 episodes, 600 updates, stage-1 KL 0.01, unclipped")]
+    columns = [("RememberColor3-v0", "640 episodes, 600 updates, kl_coef 0.01, unclipped")]
     columns += [("RememberShapeAndColor3x2-v0", HEAD_SETTING), ("InterceptFast-v0", HEAD_SETTING)]
     figure, axes = plt.subplots(2, 3, figsize=(12, 5.5), layout="constrained", sharex="col")
     metrics = {"cue_from_particle": "cue", "u_r2_prior": "R² of u"}
