@@ -110,8 +110,6 @@ class Args:
     """joints in the history, as in the paper; its authors' code has the image alone"""
     image_shift: int = 0
     """shift each episode's images by up to this many pixels while the belief is trained, against overfitting"""
-    image_erase: int = 0
-    """rectangles painted over each episode's images while the belief is trained, so that it keeps what an arm hides"""
     belief_amp: bool = BFLOAT16
     """image network in bfloat16 while the belief is trained"""
     val_every: int = 50
@@ -119,7 +117,7 @@ class Args:
 
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_shift=(0, math.inf), image_erase=(0, math.inf))
+LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_shift=(0, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
@@ -353,21 +351,6 @@ def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
         images.copy_(images.roll(shift, (1, 2)))
 
 
-def erase_images(rgb: Tensor, count: int, rng: np.random.Generator) -> None:
-    """Paint count rectangles over each episode's images rgb (T+1, B, H, W, 3) in place (Zhong et al., 2020).
-
-    Each has one colour and stays from a random step on, as an arm would that a random policy never sends there.
-    """
-    height, width = rgb.shape[2:4]
-    for images in rgb.unbind(1):
-        for _ in range(count):
-            first, y, x = rng.integers([len(images), height, width])
-            half_height, half_width = rng.integers([height // 12, width // 12], [height // 4, width // 4])
-            top, left = max(y - half_height, 0), max(x - half_width, 0)
-            color = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
-            images[first:, top : y + half_height, left : x + half_width] = color
-
-
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
@@ -530,8 +513,6 @@ def main(args: Args) -> None:
         batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
         if args.image_shift:
             shift_images(batch["rgb"], args.image_shift, rng)
-        if args.image_erase:
-            erase_images(batch["rgb"], args.image_erase, rng)
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
         if args.belief_anneal:
             optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - (update - 1) / args.num_updates))

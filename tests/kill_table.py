@@ -14,7 +14,7 @@ PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num
 SIZES = {
     "aib_repr": dict(num_episodes=12, val_fraction=0.34, epochs=3, batch_size=30, num_workers=2),
     "aib_belief": dict(
-        num_episodes=12, num_updates=6, batch_episodes=4, val_every=2, image_shift=2, image_erase=1, belief_anneal=True
+        num_episodes=12, num_updates=6, batch_episodes=4, val_every=2, image_shift=2, belief_anneal=True
     ),
     "ppo_aib": dict(num_episodes=12, total_timesteps=240, **PPO),
     "ppo_believer": dict(
@@ -24,7 +24,6 @@ SIZES = {
         batch_episodes=4,
         val_every=2,
         image_shift=2,
-        image_erase=1,
         belief_anneal=True,
         **PPO,
     ),

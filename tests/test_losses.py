@@ -280,22 +280,6 @@ def test_images_of_an_episode_are_shifted_alike_and_each_episodes_differently() 
     assert all(sum(row) == 1 for row in fits) and sum(map(any, zip(*fits, strict=True))) > 15
 
 
-def test_an_erased_rectangle_has_one_colour_and_stays_until_the_end() -> None:
-    rgb = torch.randint(0, 256, (T, 40, *IMAGE), dtype=torch.uint8)
-    erased = rgb.clone()
-    aib_belief.erase_images(erased, 1, np.random.default_rng(0))
-    starts, sizes = set(), set()
-    for old, new in zip(rgb.unbind(1), erased.unbind(1), strict=True):
-        changed = (old != new).any(-1)
-        start = int(changed.any(2).any(1).float().argmax())
-        rows, columns = changed[-1].any(1).sum().item(), changed[-1].any(0).sum().item()
-        assert not changed[:start].any() and (changed[start:] == changed[-1]).all()
-        assert changed[-1].sum() == rows * columns > 0 and len(new[-1][changed[-1]].unique(dim=0)) == 1
-        starts.add(start)
-        sizes.add((rows, columns))
-    assert len(starts) > T // 2 and len(sizes) > 10
-
-
 def test_joints_enter_the_history_standardised() -> None:
     history, batch = belief_model(config={**CONFIG, "joints_dim": 7})["belief"].history, belief_batch()
     plain = aib_belief.encode_history(history, batch)
