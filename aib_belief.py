@@ -64,7 +64,7 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """MIKASA-Robo's has a camera at its wrist, whose image is never used; panda has none"""
+    """panda_wristcam is MIKASA-Robo's; its camera at the wrist is not used"""
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
