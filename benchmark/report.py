@@ -253,28 +253,6 @@ def shift_table(evals: list[dict]) -> str:
     return markdown(head, rows)
 
 
-def known_table(beliefs: list[dict]) -> str:
-    """R² of u and error of the target position at the last step, on held-out random episodes and on an agent's."""
-    rows = []
-    metrics = ("u_r2_random", "error_cm_random", "u_r2_agent", "error_cm_agent", "u_r2_unpushed")
-    for task, setting in rows_of("known"):
-        for seed in by_seed(beliefs, "value", task=task, setting=setting, metric="u_r2_agent"):
-            of_seed = [row for row in beliefs if row["seed"] == seed]
-            cells = [belief_cell(of_seed, task, "AIB", setting, metric) for metric in metrics]
-            rows.append([task.removesuffix("-v0"), setting, seed, *cells])
-    head = [
-        "task",
-        "belief",
-        "seed",
-        "R² of u, random",
-        "cm, random",
-        "R² of u, agent",
-        "cm, agent",
-        "R² of unpushed u",
-    ]
-    return markdown(head, rows)
-
-
 # ---------------------------------------------------------------- figures
 
 
@@ -358,8 +336,7 @@ def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
     evals, beliefs = read("eval.csv"), read("beliefs.csv")
     tables = {"results": results_table(evals), "agents": agents_table(evals), "beliefs": beliefs_table(beliefs)}
-    tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals)}
-    tables |= {"shift": shift_table(evals), "known": known_table(beliefs)}
+    tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "shift": shift_table(evals)}
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
     learning_curves(evals, output / "benchmark" / "results" / "learning_curves.png")

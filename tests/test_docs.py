@@ -14,7 +14,6 @@ import experiments
 import refresh
 import report
 import true_state
-import u_geometry
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 OTHER_FLAGS = {"--no-index", "--color-words", "--logdir", "--help"}  # of git, TensorBoard, tyro
@@ -23,7 +22,7 @@ OTHER_FLAGS = {"--no-index", "--color-words", "--logdir", "--help"}  # of git, T
 def known_flags() -> set[str]:
     """Every flag of the scripts and of the benchmark's commands, with --no- for what is true or false."""
     flags = set(OTHER_FLAGS)
-    for module in (*SCRIPTS.values(), belief, experiments, refresh, report, true_state, u_geometry):
+    for module in (*SCRIPTS.values(), belief, experiments, refresh, report, true_state):
         for field in fields(module.Args):
             name = field.name.replace("_", "-")
             flags |= {f"--{name}", f"--no-{name}"}

@@ -17,7 +17,6 @@ from conftest import ROOT, SCRIPTS
 sys.path.append(str(ROOT / "benchmark"))
 import experiments
 import report
-import u_geometry
 
 TASK = "RememberShapeAndColor3x2-v0"
 
@@ -139,14 +138,3 @@ def test_every_command_of_the_matrix_is_one_the_scripts_accept() -> None:
             assert args.belief.format(**vars(args)) in made
         made |= {name + "/belief.pt"} if script == "aib_belief.py" else {name}
     assert len(experiments.commands(experiments.Args(ablations=False))[3]) == 36
-
-
-def test_u_geometry_tells_one_code_for_all_cues_from_one_for_each() -> None:
-    rng = np.random.default_rng(0)
-    cue, target = rng.integers(3, size=(900, 1)).astype(float), rng.normal(size=(900, 3))
-    slots = np.eye(3)[cue[:, 0].astype(int)][:, :, None] * target[:, None]  # a position per object, zeros but for one
-    state = np.concatenate([cue, slots.reshape(900, 9)], 1)
-    shared = u_geometry.describe(state, cue, target @ rng.normal(size=(3, 4)), 600)
-    separate = u_geometry.describe(state, cue, slots.reshape(900, 9) @ rng.normal(size=(9, 9)), 600)
-    assert shared["share_target"] == pytest.approx(1, abs=0.01) and shared["target_error_cm"] < 1
-    assert separate["share_target"] < 0.5 and separate["share_target_x_cue"] == pytest.approx(1, abs=0.01)
