@@ -39,10 +39,10 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 7  # of every .pt file and of dataset/; load refuses any other
+FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CNN_CHUNK = 2048  # images through a belief's CNN at a time; their activations take 1 to 2 GB
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -81,7 +81,7 @@ class Args:
     num_episodes: int = 2000
     """random episodes that the belief is trained on; stage 1 collects them if they are missing"""
     num_updates: int = 10_000
-    """gradient updates of the belief; taken for the paper's epochs (Table 3)"""
+    """gradient updates of the belief; the paper's 10,000 epochs (Table 3) are taken to be updates"""
     batch_episodes: int = 256
     """whole episodes per update of the belief"""
     belief_lr: float = 3e-4
@@ -118,7 +118,7 @@ class Args:
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_shift=(0, math.inf))
-MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
+MAY_DIFFER = ("overwrite", "num_workers", "sim_backend", "render_backend")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
@@ -198,7 +198,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has past actions, too; with them h_{t+1} would hold a_t, for the action head to copy.
+    The paper's history (E.2) has past actions, too: left out, as AIB's action head is to infer a_t and not to copy it.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -234,7 +234,7 @@ def chrono_init(gru: nn.GRU, steps: int) -> None:
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2); phi, for evaluations, stays fixed.
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2).
 
     config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
@@ -245,7 +245,7 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss: it stays as loaded
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss; only PPO's evaluations use it
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
@@ -268,8 +268,8 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int
     if len(chunks) == 1:
         x = history.embed(*chunks[0])
     else:
-        checkpoint = torch.utils.checkpoint.checkpoint
-        x = torch.cat([checkpoint(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
+        recompute = torch.utils.checkpoint.checkpoint
+        x = torch.cat([recompute(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
     outputs, hidden = [], None
     for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
         h, hidden = history(piece, hidden)
@@ -305,12 +305,12 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     squared error of the actions stands in L_FM's place.
     """
     h = encode_history(model["belief"].history, batch, args.bptt_steps)
-    nll, kl, z, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
+    nll, kl, z_sample, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
     losses = {"nll": nll.mean(), "kl": kl.mean()}
     losses["total"] = losses["nll"] + args.beta * losses["kl"]
     if args.action_head != "none":
-        z = z_mean if args.fm_latent == "mean" else z
-        action, z, z_next = batch["actions"], z[:-1], z[1:]
+        latent = z_mean if args.fm_latent == "mean" else z_sample
+        action, z, z_next = batch["actions"], latent[:-1], latent[1:]
         if args.action_head == "flow":
             noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
             losses["action"] = flow_matching_loss(model["head"], action, z, z_next, noise, tau).mean()
@@ -354,7 +354,7 @@ def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    default = Args.repr_dir
+    default = Args.repr_dir  # a directory of another name is not made here
     if args.small:
         default = SMALL["repr_dir"]
     if args.quick:
@@ -364,7 +364,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
-    stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())
+    stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())  # a belief is resumed on its own phi only
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
     try:
@@ -403,8 +403,9 @@ def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
 def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> dict[str, Tensor]:
     """What the belief makes of episodes index (E,).
 
-    h (E, T+1, 256); u (E, T+1, u_dim), action (E, T, A), cue (E, K) as they were; z, z_mean (E, T+1, z_dim) of q(z|u,h)
-    particle (E, T+1, u_dim): mean of 30 decoded prior samples; posterior (E, T+1, u_dim): z_mean decoded
+    h (E, T+1, 256); u (E, T+1, u_dim), actions (E, T, A), cue (E, K) as they were
+    z, z_mean (E, T+1, z_dim): sample and mean of q(z|u,h)
+    u_prior (E, T+1, u_dim): mean of 30 particles, decoded samples of p(z|h); u_posterior: z_mean decoded
     nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows of
     three possible places is right about each; nll_posterior (E, T+1): -log p(u|z,h) under z
     """
@@ -416,10 +417,11 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
         nll, _, z, mean = elbo_terms(belief, posterior, u, h)
         decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
-        part = {"h": h, "u": u, "particle": decoded.mean.mean(-2), "z": z, "z_mean": mean}
-        part |= {"nll_prior": math.log(30) - log_p.logsumexp(-1), "nll_posterior": nll}
-        part["posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
-        part["action"] = batch["actions"]
+        part = {"h": h, "u": u, "actions": batch["actions"], "z": z, "z_mean": mean}
+        part["u_prior"] = decoded.mean.mean(-2)
+        part["u_posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
+        part["nll_prior"] = math.log(30) - log_p.logsumexp(-1)
+        part["nll_posterior"] = nll
         part = {name: x.transpose(0, 1) for name, x in part.items()}
         part["cue"] = batch["cue"]
         parts.append(part)
@@ -434,15 +436,16 @@ def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
     action_readout, probe of a_t from z_mean at t and t + 1; cue_chance, accuracy of guessing (0 for R2).
     """
     report = {name: test[name].mean().item() for name in ("nll_prior", "nll_posterior")}
-    for name, source in (("u_r2_prior", "particle"), ("u_r2_posterior", "posterior")):
-        residual = (test["u"] - test[source]).square().sum((0, 2))
-        report[name] = (1 - residual / (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)).tolist()
-    for name in ("h", "particle", "u"):
-        steps = zip(fit[name].unbind(1), test[name].unbind(1), strict=True)
+    total = (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)
+    for name in ("prior", "posterior"):
+        residual = (test["u"] - test[f"u_{name}"]).square().sum((0, 2))
+        report[f"u_r2_{name}"] = (1 - residual / total).tolist()
+    for name, source in (("h", "h"), ("particle", "u_prior"), ("u", "u")):
+        steps = zip(fit[source].unbind(1), test[source].unbind(1), strict=True)
         report[f"cue_from_{name}"] = [probe_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
     pairs, pairs_test = (torch.cat([x["z_mean"][:, :-1], x["z_mean"][:, 1:]], -1).flatten(0, 1) for x in (fit, test))
-    action, action_test = (x["action"].flatten(0, 1) for x in (fit, test))
-    report["action_readout"] = probe_score(pairs, action, pairs_test, action_test)
+    actions, actions_test = (x["actions"].flatten(0, 1) for x in (fit, test))
+    report["action_readout"] = probe_score(pairs, actions, pairs_test, actions_test)
     cue = fit["cue"][:, fit["cue"].amax(0) > fit["cue"].amin(0)]
     report["cue_chance"] = 0.0
     if cue.numel() and are_classes(cue):
@@ -458,8 +461,10 @@ def flow_gain(head: nn.Module, z: Tensor, action: Tensor) -> tuple[float, float]
     """
     torch.manual_seed(0)
     noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
-    right, wrong = (flow_matching_loss(head, action, x[:, :-1], x[:, 1:], noise, tau).mean() for x in (z, z.roll(1, 0)))
-    return right.item(), (wrong - right).item()
+    loss = flow_matching_loss(head, action, z[:, :-1], z[:, 1:], noise, tau).mean()
+    z = z.roll(1, 0)  # of other episodes
+    shuffled = flow_matching_loss(head, action, z[:, :-1], z[:, 1:], noise, tau).mean()
+    return loss.item(), (shuffled - loss).item()
 
 
 # ---------------------------------------------------------------- training
@@ -482,6 +487,7 @@ def main(args: Args) -> None:
     config |= {"state_dim": len(stored["phi"]["mean"]), "u_dim": stored["u_dim"]}
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": AIBBelief(config, args.belief_amp)})
+    # posterior and head serve training alone: belief.pt goes without them
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     if args.action_head != "none":
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
@@ -528,7 +534,7 @@ def main(args: Args) -> None:
 
         if update % args.val_every == 0 or update == args.num_updates:
             held_out = encode(model["belief"], model["posterior"], episodes, test_on)
-            error = (held_out["u"] - held_out["particle"]).square().sum(-1).mean().item()
+            error = (held_out["u"] - held_out["u_prior"]).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
             writer.add_scalar("belief/held_out_nll_prior", held_out["nll_prior"].mean(), update)
             writer.add_scalar("belief/held_out_nll_posterior", held_out["nll_posterior"].mean(), update)
@@ -541,8 +547,8 @@ def main(args: Args) -> None:
     fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
     report = probe_belief(fit, test)
     if args.action_head == "flow":
-        report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["action"])
-        sampled = flow_gain(model["head"], test["z"], test["action"])
+        report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["actions"])
+        sampled = flow_gain(model["head"], test["z"], test["actions"])
         report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
     writer.close()
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
@@ -564,7 +570,7 @@ def fail(message: str) -> NoReturn:
 
 def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
-    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
+    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)  # only for what selects the defaults
     settings = TASKS.get(chosen.env_id, {})
     if chosen.small:
         settings = settings | SMALL

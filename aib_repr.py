@@ -1,10 +1,11 @@
 """AIB stage 1: a random-policy dataset and a compact encoder of the privileged state (paper section 3.1, Algorithm 1).
 
-phi(s) is trained with psi(o) to predict reward and next latents, and pays by its KL for what it carries: it is left
-with what matters and cannot be seen. Only phi is kept, with how psi standardises images and joints.
+phi(s) is trained with psi(o) to predict reward and next latents. A KL penalty leaves in u = phi(s) what helps to
+predict and is not in o. Only phi is kept, and the means and standard deviations of images and joints.
 
 Usage:   python aib_repr.py --env-id InterceptFast-v0
-Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events
+Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events; args.json and checkpoint.pt to
+         resume
 """
 
 import difflib
@@ -44,9 +45,9 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 7  # of every .pt file and of dataset/; load refuses any other
+FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -239,20 +240,21 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> d
     r_hat, s_hat, o_hat = g(q_s.rsample(), q_o.rsample(), batch["actions"])  # lines 4 and 5
     with torch.no_grad():  # line 6; the mean of a target gives the gradient of a sample with less noise
         s_next, o_next = phi(batch["next_state"]).mean, psi(batch.get("next_rgb"), batch["next_joints"]).mean
-    reward = ((batch["rewards"] - g.reward_mean) / g.reward_std - r_hat).square().mean()  # line 7
-    state = (s_next - s_hat).square().sum(-1).mean()  # line 8
-    obs = (o_next - o_hat).square().sum(-1).mean()  # line 9
+    loss_r = ((batch["rewards"] - g.reward_mean) / g.reward_std - r_hat).square().mean()  # line 7
+    loss_s = (s_next - s_hat).square().sum(-1).mean()  # line 8
+    loss_o = (o_next - o_hat).square().sum(-1).mean()  # line 9
     kl = kl_divergence(q_s, Normal(0.0, 1.0))  # line 10
     kl = kl.sum(-1).mean() if args.kl_reduction == "sum" else kl.mean()
-    total = args.reward_coef * reward + args.state_coef * state + args.obs_coef * obs + args.kl_coef * kl  # line 11
-    return {"reward": reward, "state": state, "obs": obs, "kl": kl, "total": total}
+    # line 11
+    total = args.reward_coef * loss_r + args.state_coef * loss_s + args.obs_coef * loss_o + args.kl_coef * kl
+    return {"reward": loss_r, "state": loss_s, "obs": loss_o, "kl": kl, "total": total}
 
 
 # ---------------------------------------------------------------- data
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise of shape (..., T), N(0, 1) at each step, with spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023), N(0, 1) at each step within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     # the package scales it to a standard deviation of 1 as if there were no power at f = 0: scale it down by that
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))
@@ -308,7 +310,7 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
                 dtype, shape = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32), (count, *x.shape[1:])
                 arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, shape)
         for name, x in buffer.items():
-            arrays[name][rows[: count - first]] = x[: count - first].cpu()
+            arrays[name][first : first + envs.num_envs] = x[: count - first].cpu()
         meta["episodes_done"] = min(first + envs.num_envs, count)
         save(path / "meta.json", json.dumps(meta, indent=2).encode())
     bar.close()
@@ -348,11 +350,11 @@ def main(args: Args) -> None:
     num_val = round(args.num_episodes * args.val_fraction)
     if not 4 <= num_val < args.num_episodes:  # stage 2 fits read-outs on half of them and tests them on the other
         fail(f"--val-fraction {args.val_fraction} of --num-episodes {args.num_episodes} must be 4 or more, and not all")
-    check_task(args)
     path, device = check_run(args), torch.device(args.device)
     if (path / "repr.pt").exists() and not args.overwrite:
         print(f"{path / 'repr.pt'} is finished; --overwrite recreates it")
         return
+    check_task(args)
     open_run(path, args)
     arrays = collect_random_episodes(args, path / "dataset")
     transitions = TransitionDataset(path / "dataset", args.psi_images, device)
@@ -395,12 +397,14 @@ def main(args: Args) -> None:
             losses = repr_losses(model, transitions(index), args)
             optimizer.zero_grad()
             losses["total"].backward()
-            nn.utils.clip_grad_norm_(model.parameters(), math.inf, error_if_nonfinite=True)  # only stops at NaN
+            nn.utils.clip_grad_norm_(
+                model.parameters(), math.inf, error_if_nonfinite=True
+            )  # clips nothing, stops at NaN
             optimizer.step()
             bar.update()
 
         with torch.no_grad():
-            val_batch = transitions(val_inds[:: len(val_inds) // 1000 + 1])
+            val_batch = transitions(np.random.default_rng(0).choice(val_inds, min(1000, len(val_inds)), replace=False))
             val_losses = repr_losses(model, val_batch, args)
             active = (phi(val_batch["state"]).mean.std(0) > 0.1).sum()
         update = (epoch + 1) * per_epoch
@@ -440,20 +444,23 @@ class PrivilegedInfoWrapper(gym.Wrapper):
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        # A task's evaluate hides objects at z = 1000; _view takes the picture and moves them back. On the GPU simulator
-        # the next physics step moves them back by itself.
+        # Reset and step call the task's evaluate, which hides objects at z = 1000. On physx_cpu they would stay there:
+        # note where they were; _view takes the picture and puts them back before the next physics step.
         if not self.task.gpu_sim_enabled:
             self.task.evaluate = evaluate_and_note_poses
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))  # pictures belong to it now
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
-        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()  # a copy; the next is drawn over it
+        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"]
+        rgb = rgb.clone(memory_format=torch.contiguous_format)  # the next picture is drawn over this one
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
         seen = {"agent": obs_dict["agent"], "tcp_pose": obs_dict["extra"].pop("tcp_pose")}
         state = common.flatten_state_dict(obs_dict["extra"], use_torch=True).float()
-        state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
+        state = torch.where(
+            state.abs() > 500, 1.0, state
+        )  # a hidden object 1 m up, not 1 km, which would drown all else
         cue = self.task.oracle_info.float().reshape(len(state), -1)
         obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}
@@ -598,7 +605,7 @@ def fail(message: str) -> NoReturn:
 
 def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
-    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
+    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)  # only for what selects the defaults
     settings = TASKS.get(chosen.env_id, {})
     if chosen.small:
         settings = settings | SMALL

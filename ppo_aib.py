@@ -52,9 +52,9 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 7  # of every .pt file and of dataset/; load refuses any other
+FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # natively
+BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
 EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; training has those below 2**30, stage 1 those between
 TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, never used for training or tuning
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -93,7 +93,7 @@ class Args:
     belief: str = "runs/{env_id}__aib_belief__{seed}/belief.pt"
     """belief of stage 2"""
     num_episodes: int = 2000
-    """random episodes that the belief is trained on; stage 1 collects them if they are missing"""
+    """random episodes that the belief was trained on; handed to the earlier stages where they run first"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
     sample_decoder: bool = True
@@ -135,15 +135,15 @@ class Args:
     amp: bool = False
     """image networks of policy and belief in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint, with the task, robot, sizes and precision that are stored in it"""
+    """only evaluate --checkpoint; task, robot, num_envs, amp and the like are those stored in it"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
-LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf))
-MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "evaluate", "checkpoint")  # when a run is resumed
+LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
+MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
@@ -228,7 +228,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has past actions, too; with them h_{t+1} would hold a_t, for the action head to copy.
+    The paper's history (E.2) has past actions, too: left out, as AIB's action head is to infer a_t and not to copy it.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -255,7 +255,7 @@ class HistoryEncoder(nn.Module):
 
 
 class AIBBelief(nn.Module):
-    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2); phi, for evaluations, stays fixed.
+    """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2).
 
     config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
     """
@@ -266,7 +266,7 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config, amp)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss: it stays as loaded
+        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss; only PPO's evaluations use it
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
@@ -284,7 +284,7 @@ class Agent(nn.Module):
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # mean and variance of all iterations so far; main updates them, until then it changes nothing
+        # a running standardiser: mean of all iterations' means and variances; without updates it changes nothing
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -344,7 +344,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise of shape (..., T), N(0, 1) at each step, with spectrum 1/f**beta over time (Eberhard et al., 2023)."""
+    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023), N(0, 1) at each step within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     # the package scales it to a standard deviation of 1 as if there were no power at f = 0: scale it down by that
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))
@@ -396,7 +396,8 @@ def rollout(
             if t == steps:
                 break  # the last observation is only for its value
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)  # each step's own, also of coloured noise
+            # each step's own, also of coloured noise; of the action before it is clamped
+            step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
             if deterministic:
                 step["state"] = torch.as_tensor(info["state"], dtype=torch.float32, device=device)
             obs, rewards, _, _, info = envs.step(step["actions"].clamp(-1, 1).cpu().numpy())
@@ -404,8 +405,8 @@ def rollout(
             step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
             for name, value in step.items():
                 if name not in buffer:
-                    shape = (steps, num_episodes, *value.shape[1:])
-                    buffer[name] = torch.empty(shape, dtype=value.dtype, device=device)
+                    buffer_shape = (steps, num_episodes, *value.shape[1:])
+                    buffer[name] = torch.empty(buffer_shape, dtype=value.dtype, device=device)
                 buffer[name][t, kept] = value[: len(kept)]
             bar.update()
     bar.close()
@@ -415,7 +416,7 @@ def rollout(
 def load_belief(args: Args) -> dict:
     """Read stage 2's belief.pt, made first where it is missing."""
     file = Path(args.belief.format(**vars(args)))
-    default = Args.belief
+    default = Args.belief  # a file of another name is not made here
     if args.small:
         default = SMALL["belief"]
     if args.quick:
@@ -441,7 +442,7 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
-    rgb = buffer["rgb"][:, :4].cpu().numpy().repeat(2, 2).repeat(2, 3)
+    rgb = buffer["rgb"][:, :4].cpu().numpy().repeat(2, axis=2).repeat(2, axis=3)
     succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
     rgb[1:, :, :8][succeeded] = (0, 255, 0)
     rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)
@@ -509,7 +510,8 @@ def main(args: Args) -> None:
     stored = load_belief(args)
     if checkpoint:
         for name, x in stored["belief"].items():
-            if not torch.equal(checkpoint["agent"].get(f"belief.{name}", torch.empty(0)), x):
+            old = checkpoint["agent"].get(f"belief.{name}")
+            if old is None or not torch.equal(old, x):
                 file = args.belief.format(**vars(args))
                 fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
     open_run(path, args)
@@ -528,7 +530,8 @@ def main(args: Args) -> None:
     bar = tqdm(total=num_iterations * per_iteration, initial=completed * per_iteration, desc="PPO", unit="step")
 
     for iteration in range(completed + 1, num_iterations + 1):
-        start, global_step = time.time(), iteration * per_iteration
+        start = time.time()
+        global_step = iteration * per_iteration  # after this iteration
         torch.manual_seed(args.seed * 1_000_000 + iteration)  # so that a resumed run repeats the iteration
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
         buffer = rollout(envs, agent, args, seeds)
@@ -544,14 +547,15 @@ def main(args: Args) -> None:
         for _ in range(args.update_epochs):
             for mb_inds in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
                 losses = ppo_losses(agent, {name: x[mb_inds] for name, x in batch.items()}, args)
-                if losses["approx_kl"] > args.target_kl:
+                stop = losses["approx_kl"] > args.target_kl
+                if stop:
                     break
                 optimizer.zero_grad()
                 losses["total"].backward()
                 nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
                 optimizer.step()
                 applied.append({name: x.detach() for name, x in losses.items()})
-            if losses["approx_kl"] > args.target_kl:
+            if stop:
                 break
         for name in losses:
             # of the minibatch that ended the update, if there was no step before it
@@ -561,7 +565,8 @@ def main(args: Args) -> None:
         scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
         if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
-            agent.joints_norm.train()(batch["joints"])  # only its statistics matter
+            agent.joints_norm.train()
+            agent.joints_norm(batch["joints"])  # for its statistics alone
             agent.joints_norm.eval()
         del buffer, batch, losses  # a gigabyte of images, before the evaluation has its own
 
@@ -613,20 +618,23 @@ class PrivilegedInfoWrapper(gym.Wrapper):
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        # A task's evaluate hides objects at z = 1000; _view takes the picture and moves them back. On the GPU simulator
-        # the next physics step moves them back by itself.
+        # Reset and step call the task's evaluate, which hides objects at z = 1000. On physx_cpu they would stay there:
+        # note where they were; _view takes the picture and puts them back before the next physics step.
         if not self.task.gpu_sim_enabled:
             self.task.evaluate = evaluate_and_note_poses
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))  # pictures belong to it now
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
-        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"].contiguous()  # a copy; the next is drawn over it
+        rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"]
+        rgb = rgb.clone(memory_format=torch.contiguous_format)  # the next picture is drawn over this one
         for actor, pose in self.poses.items():
             if not torch.equal(actor.pose.raw_pose, pose):
                 actor.pose = pose
         seen = {"agent": obs_dict["agent"], "tcp_pose": obs_dict["extra"].pop("tcp_pose")}
         state = common.flatten_state_dict(obs_dict["extra"], use_torch=True).float()
-        state = torch.where(state.abs() > 500, 1.0, state)  # z = 1000 of a hidden object would drown all else
+        state = torch.where(
+            state.abs() > 500, 1.0, state
+        )  # a hidden object 1 m up, not 1 km, which would drown all else
         cue = self.task.oracle_info.float().reshape(len(state), -1)
         obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}
@@ -771,7 +779,7 @@ def fail(message: str) -> NoReturn:
 
 def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
-    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)
+    chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)  # only for what selects the defaults
     settings = TASKS.get(chosen.env_id, {})
     if chosen.small:
         settings = settings | SMALL

@@ -227,7 +227,7 @@ def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
             density += d.log_prob(batch["u"]).sum(-1).exp() / 30
             means += d.mean / 30
     assert torch.allclose(seen["nll_prior"], -density.log().T, atol=1e-4)
-    assert torch.allclose(seen["particle"], means.transpose(0, 1), atol=1e-5)
+    assert torch.allclose(seen["u_prior"], means.transpose(0, 1), atol=1e-5)
 
 
 def test_sequence_and_step_path_agree() -> None:
@@ -369,9 +369,9 @@ def test_report_of_a_belief_that_knows_and_of_its_chance() -> None:
     for cue, chance in ((velocity, 0.0), (colour, 0.25), (torch.cat([colour, colour > 1], 1), (0.25 + 0.5) / 2)):
         u = cue[:, None].expand(-1, T + 1, -1).clone()
         known = torch.nn.functional.one_hot(colour[:, 0].long(), 4)[:, None].float().expand(-1, T + 1, -1)
-        seen = {"u": u, "particle": u + 0.1, "posterior": u, "h": torch.cat([u, known], -1), "cue": cue}
+        seen = {"u": u, "u_prior": u + 0.1, "u_posterior": u, "h": torch.cat([u, known], -1), "cue": cue}
         seen |= {"nll_prior": torch.ones(40, T + 1), "nll_posterior": torch.zeros(40, T + 1)}
-        seen |= {"z_mean": torch.randn(40, T + 1, 5), "action": torch.rand(40, T, A)}
+        seen |= {"z_mean": torch.randn(40, T + 1, 5), "actions": torch.rand(40, T, A)}
         report = aib_belief.probe_belief(*({name: x[part] for name, x in seen.items()} for part in (SELECT, REPORT)))
         assert report["cue_chance"] == pytest.approx(chance)
         assert (report["nll_prior"], report["nll_posterior"]) == (1, 0)
