@@ -20,7 +20,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import aib_repr
-from conftest import ROOT, TASK, run
+import ppo_baseline
+from conftest import ROOT, TASK, run, spaces
+
+sys.path.append(str(ROOT / "benchmark"))
+import reach  # noqa: E402
+import true_state  # noqa: E402
 
 
 def test_dataset(quick_runs: Path) -> None:
@@ -103,55 +108,49 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
     assert f"return {metrics['return']:.3f}" in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
-def refresh(quick_runs: Path, script: str, source: str = "aib_repr_quick") -> tuple[int, str, str]:
-    """Let a script's agent play every second scene of the quick dataset: exit code, stdout, stderr."""
-    options = ["--agent", f"runs/{TASK}__{script}_quick__1/agent.pt", "--exp-name", f"{source}_and_{script}"]
-    options += ["--repr-dir", f"runs/{{env_id}}__{source}__{{seed}}"]
-    return run("benchmark/refresh", *options, cwd=quick_runs.parent)
+def run_reach(quick_runs: Path, agent: str) -> tuple[int, str, str]:
+    """Let an agent play every second scene of the quick dataset: exit code, stdout, stderr."""
+    options = ["--env-id", TASK, "--exp-name", "aib_repr_quick_reach", "--num-workers", "2"]
+    options += ["--repr-dir", "runs/{env_id}__aib_repr_quick__{seed}", "--agent", agent]
+    return run("benchmark/reach", *options, cwd=quick_runs.parent)
 
 
-@pytest.mark.thorough
-def test_refresh_adds_episodes_of_the_agent(quick_runs: Path) -> None:
-    """The same scenes, other actions, the same phi; stage 2 trains on it, and nothing that exists is overwritten."""
-    code, out, err = refresh(quick_runs, "ppo_aib")
-    assert code == 0 and "4 episodes of the agent" in out and "need --num-episodes 12" in out, err
-    paths = [quick_runs / f"{TASK}__{name}__1" for name in ("aib_repr_quick", "aib_repr_quick_and_ppo_aib")]
-    stored = [torch.load(path / "repr.pt", weights_only=True) for path in paths]
-    assert [(x["num_episodes"], x["num_val"]) for x in stored] == [(8, 4), (12, 6)]
-    assert all(torch.equal(x, y) for x, y in zip(stored[0]["phi"].values(), stored[1]["phi"].values(), strict=True))
-    before, after = ({file.stem: np.load(file) for file in (path / "dataset").glob("*.npy")} for path in paths)
+def test_reach_plays_every_second_scene_anew_and_stage_1_takes_it(quick_runs: Path) -> None:
+    agent = true_state.StateAgent(spaces([1, 1, 3], 28, 8), ppo_baseline.Args())
+    content = {"kind": "ppo_baseline agent", "env_id": TASK, "agent": agent.state_dict()}
+    ppo_baseline.save(quick_runs / "agents" / "target.pt", content)
+    code, _, err = run_reach(quick_runs, f"runs/{TASK}__ppo_baseline_quick__1/agent.pt")
+    assert code == 2 and "sees other things than joints and a position" in err
+    code, out, err = run_reach(quick_runs, "runs/agents/target.pt")
+    assert code == 0 and "4 episodes of reaching" in out, err
+    path = quick_runs / f"{TASK}__aib_repr_quick_reach__1"
+    code, out, err = run(
+        "aib_repr", "--env-id", TASK, "--quick", "--exp-name", path.name.split("__")[1], cwd=path.parents[1]
+    )
+    assert code == 0 and (path / "repr.pt").exists(), err
+    folders = [quick_runs / f"{TASK}__aib_repr_quick__1", path]
+    before, after = ({file.stem: np.load(file) for file in (x / "dataset").glob("*.npy")} for x in folders)
     assert before.keys() == after.keys()
-    by_random, by_agent = [0, 1, 3, 4, 6, 7, 9, 10], [2, 5, 8, 11]
     for name, x in before.items():
-        assert x.dtype == after[name].dtype and np.array_equal(x, after[name][by_random])
-    assert np.allclose(before["state"][1::2, 0], after["state"][by_agent, 0], atol=1e-5), "the same scenes"
-    assert np.array_equal(before["cue"][1::2], after["cue"][by_agent])
-    env = aib_repr.make_task(aib_repr.Args(env_id=TASK), 1)
+        assert x.dtype == after[name].dtype and np.array_equal(x[::2], after[name][::2])
+    assert np.allclose(before["state"][1::2, 0], after["state"][1::2, 0], atol=1e-5), "the same scenes"
+    assert np.array_equal(before["cue"], after["cue"])
+    env = reach.RandomGoal(aib_repr.make_task(aib_repr.Args(env_id=TASK), 1))
+    goals = set()
+    for seed in range(12):
+        obs, _ = env.reset(seed=seed)
+        goals |= {i for i, x in enumerate(env.objects) if np.array_equal(x.pose.p[0].numpy(), obs["goal"])}
+    assert len(goals) > 3, "not always the same object"
     env.reset(seed=1_000_003 % 2**29 + 2**30)
-    for t, action in enumerate(after["actions"][5, :20]):
+    for t, action in enumerate(after["actions"][3, :20]):
         assert not np.array_equal(action, before["actions"][3, t])
         obs, reward, _, _, info = env.step(action)
-        assert np.allclose(after["joints"][5, t + 1], obs["joints"], atol=1e-5), "what the action led to comes after it"
-        assert np.allclose(after["state"][5, t + 1], info["state"], atol=1e-5)
-        assert np.isclose(after["rewards"][5, t], reward, atol=1e-5)
+        assert np.allclose(after["joints"][3, t + 1], obs["joints"], atol=1e-5), "what the action led to comes after it"
+        assert np.allclose(after["state"][3, t + 1], info["state"], atol=1e-5)
+        assert np.isclose(after["rewards"][3, t], reward, atol=1e-5)
     env.close()
-    again, _, err = refresh(quick_runs, "ppo_aib")
+    again, _, err = run_reach(quick_runs, "runs/agents/target.pt")
     assert again == 2 and "exists; choose another --exp-name" in err
-    twice, _, err = refresh(quick_runs, "ppo_aib", source="aib_repr_quick_and_ppo_aib")
-    assert twice == 2 and "is a refreshed dataset" in err
-    stage = ["--quick", "--repr-dir", "runs/{env_id}__aib_repr_quick_and_ppo_aib__{seed}", "--exp-name", "refreshed"]
-    code, _, err = run("aib_belief", "--env-id", TASK, "--num-episodes", "12", *stage, cwd=quick_runs.parent)
-    assert code == 0, err
-
-
-@pytest.mark.thorough
-def test_refresh_takes_believers_agent(quick_runs: Path) -> None:
-    assert refresh(quick_runs, "ppo_believer")[0] == 0
-
-
-def test_refresh_takes_no_agent_without_belief(quick_runs: Path) -> None:
-    code, _, err = refresh(quick_runs, "ppo_baseline")
-    assert code == 2 and "is a file of another kind (ppo_baseline agent)" in err
 
 
 def test_an_episode_follows_from_its_seed_and_actions_in_whatever_process(quick_runs: Path) -> None:

@@ -1,0 +1,149 @@
+"""Stage 1's dataset with every second episode played by an agent that reaches for an object drawn at random.
+
+Beliefs are trained on a random policy's episodes, in which the arm hardly comes near the objects. Once PPO sends it
+there they fail. An agent of true_state.py --target knows how to reach. Here it is shown an object drawn at random in
+place of the target, so that where the arm goes tells nothing of the cue. Stages 1 and 2 are trained on these episodes.
+
+Usage:   python aib_repr.py --env-id RememberColor5-v0 --small
+         python benchmark/true_state.py --env-id RememberColor5-v0 --small --target --total-timesteps 100800
+         python benchmark/reach.py --env-id RememberColor5-v0
+         python aib_repr.py --env-id RememberColor5-v0 --small --exp-name aib_repr_reach
+         python aib_belief.py --env-id RememberColor5-v0 --small --exp-name aib_belief_reach \
+             --repr-dir 'runs/{env_id}__aib_repr_reach__{seed}'
+         python ppo_aib.py --env-id RememberColor5-v0 --small --exp-name ppo_aib_reach \
+             --belief 'runs/{env_id}__aib_belief_reach__{seed}/belief.pt'
+         (Believer: ppo_believer.py with that --repr-dir)
+Reads:   dataset/ of a run of stage 1 on physx_cpu; agent.pt of true_state.py --target
+Writes:  runs/{env_id}__{exp_name}__{seed}/dataset/, which aib_repr.py takes for its own
+"""
+
+import json
+import os
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+from true_state import StateAgent  # noqa: E402
+
+import ppo_baseline  # noqa: E402
+from ppo_baseline import fail  # noqa: E402
+
+
+@dataclass
+class Args:
+    env_id: str = "RememberColor5-v0"
+    """a task of objects on a table: RememberColor, RememberShape, RememberShapeAndColor"""
+    seed: int = 1
+    """seed of the run of stage 1"""
+    repr_dir: str = "runs/{env_id}__aib_repr_small__{seed}"
+    """run directory of stage 1"""
+    agent: str = "runs/{env_id}__true_target_small__{seed}/agent.pt"
+    """agent of true_state.py --target"""
+    exp_name: str = "aib_repr_reach"
+    """the episodes go to runs/{env_id}__{exp_name}__{seed}/dataset"""
+    num_workers: int = ppo_baseline.Args.num_workers
+    """simulator processes"""
+
+
+class RandomGoal(gym.Wrapper):
+    """Adds goal (3,) to the observation: the position of an object that is drawn by the episode's seed."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        task = env.unwrapped
+        self.objects = list((task.cubes if hasattr(task, "cubes") else task.shapes).values())
+        goal = gym.spaces.Box(-np.inf, np.inf, (3,))
+        self.observation_space = gym.spaces.Dict({**env.observation_space.spaces, "goal": goal})
+
+    def _show(self, obs: dict) -> dict:
+        return {**obs, "goal": self.goal.pose.p[0].numpy()}
+
+    def reset(self, *, seed: int, options: dict | None = None) -> tuple:
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.goal = self.objects[np.random.default_rng(seed).integers(len(self.objects))]
+        return self._show(obs), info
+
+    def step(self, action: np.ndarray) -> tuple:
+        obs, *others = self.env.step(action)
+        return self._show(obs), *others
+
+
+def make_envs(args: ppo_baseline.Args) -> gym.vector.VectorEnv:
+    """args.num_workers processes of one scene each, all episodes of max_episode_steps, no auto-reset."""
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
+    workers = [lambda: RandomGoal(ppo_baseline.make_task(args, 1))] * args.num_workers
+    return gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
+
+
+def load_agent(args: Args) -> StateAgent:
+    """The agent of true_state.py --target."""
+    hint = "name an agent.pt of true_state.py --target with --agent"
+    file = Path(args.agent.format(**vars(args)))
+    weights = ppo_baseline.load(file, hint, kind="ppo_baseline agent", env_id=args.env_id)["agent"]
+    joints = gym.spaces.Box(-np.inf, np.inf, weights["joints_norm.running_mean"].shape)
+    if joints.shape != (25 + 3,):
+        fail(f"{file} sees other things than joints and a position; {hint}")
+    actions = gym.spaces.Box(-1, 1, weights["log_std"].shape)
+    spaces = SimpleNamespace(single_observation_space={"joints": joints}, single_action_space=actions)
+    agent = StateAgent(spaces, ppo_baseline.Args())
+    agent.load_state_dict(weights)
+    return agent
+
+
+@torch.no_grad()
+def main(args: Args) -> None:
+    """Copy the dataset and play every second scene of it anew; whole or not at all."""
+    source = Path(args.repr_dir.format(**vars(args))) / "dataset"
+    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}" / "dataset"
+    if path.exists():
+        fail(f"{path} exists; choose another --exp-name")
+    if not (source / "meta.json").exists():
+        fail(f"{source} does not exist; name a run of aib_repr.py with --repr-dir")
+    meta = json.loads((source / "meta.json").read_text())
+    if meta["sim_backend"] != "physx_cpu":
+        fail(f"{source} is of physx_cuda, which draws scenes by batch; only those of physx_cpu can be played again")
+    settings = ppo_baseline.Args(env_id=args.env_id, robot=meta["robot"], robot_triangles=meta["robot_triangles"])
+    settings.sim_backend, settings.num_workers = "physx_cpu", args.num_workers
+    ppo_baseline.check_task(settings)
+    agent, envs = load_agent(args), make_envs(settings)
+    part = path.with_name("dataset.part")
+    shutil.rmtree(part, ignore_errors=True)
+    shutil.copytree(source, part)
+    arrays = {file.stem: np.load(file, mmap_mode="r+") for file in part.glob("*.npy")}
+    steps = arrays["actions"].shape[1]
+    episodes = np.arange(1, meta["num_episodes"], 2)
+    torch.manual_seed(args.seed)
+    bar = tqdm(total=len(episodes) * steps, desc="reaching", unit="step")
+    for first in range(0, len(episodes), envs.num_envs):
+        rows = episodes[first : first + envs.num_envs]
+        seeds = (args.seed * 1_000_000 + rows) % 2**29 + 2**30  # as in aib_repr.collect_random_episodes
+        obs, info = envs.reset(seed=np.resize(seeds, envs.num_envs).tolist())
+        for t in range(steps + 1):
+            for name, x in (("rgb", obs["rgb"]), ("joints", obs["joints"]), ("state", info["state"])):
+                arrays[name][rows, t] = x[: len(rows)]
+            if t == steps:
+                break
+            seen = torch.from_numpy(np.concatenate([obs["joints"], obs["goal"]], 1)).float()
+            actions = agent({"joints": seen})[0].sample().clamp(-1, 1).numpy()
+            obs, rewards, _, _, info = envs.step(actions)
+            for name, x in (("actions", actions), ("rewards", rewards), ("success", info["success"])):
+                arrays[name][rows, t] = x[: len(rows)]
+            bar.update(len(rows))
+    bar.close()
+    envs.close()
+    success = arrays["success"][1::2].any(1).mean()
+    os.replace(part, path)
+    print(f"{path}: {len(episodes)} episodes of reaching, success_once {success:.2f} (chance: one of the objects)")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
