@@ -2,22 +2,20 @@
 
 Beliefs are trained on a random policy's episodes, in which the arm hardly comes near the objects. Once PPO sends it
 there they fail. An agent of true_state.py --target knows how to reach. Here it is shown an object drawn at random in
-place of the target, so that where the arm goes tells nothing of the cue. Stages 1 and 2 are trained on these episodes.
+place of the target, so that where the arm goes tells nothing of the cue. Stage 2 is trained on these; phi stays.
 
 Usage:   python aib_repr.py --env-id RememberColor5-v0 --small
          python benchmark/true_state.py --env-id RememberColor5-v0 --small --target --total-timesteps 100800
          python benchmark/reach.py --env-id RememberColor5-v0
-         python aib_repr.py --env-id RememberColor5-v0 --small --exp-name aib_repr_reach
          python aib_belief.py --env-id RememberColor5-v0 --small --exp-name aib_belief_reach \
              --repr-dir 'runs/{env_id}__aib_repr_reach__{seed}'
          python ppo_aib.py --env-id RememberColor5-v0 --small --exp-name ppo_aib_reach \
              --belief 'runs/{env_id}__aib_belief_reach__{seed}/belief.pt'
          (Believer: ppo_believer.py with that --repr-dir)
-Reads:   dataset/ of a run of stage 1 on physx_cpu; agent.pt of true_state.py --target
-Writes:  runs/{env_id}__{exp_name}__{seed}/dataset/, which aib_repr.py takes for its own
+Reads:   dataset/ and repr.pt of a run of stage 1 on physx_cpu; agent.pt of true_state.py --target
+Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt
 """
 
-import json
 import os
 import shutil
 import sys
@@ -49,7 +47,7 @@ class Args:
     agent: str = "runs/{env_id}__true_target_small__{seed}/agent.pt"
     """agent of true_state.py --target"""
     exp_name: str = "aib_repr_reach"
-    """the episodes go to runs/{env_id}__{exp_name}__{seed}/dataset"""
+    """results go to runs/{env_id}__{exp_name}__{seed}"""
     num_workers: int = ppo_baseline.Args.num_workers
     """simulator processes"""
 
@@ -101,26 +99,25 @@ def load_agent(args: Args) -> StateAgent:
 
 @torch.no_grad()
 def main(args: Args) -> None:
-    """Copy the dataset and play every second scene of it anew; whole or not at all."""
-    source = Path(args.repr_dir.format(**vars(args))) / "dataset"
-    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}" / "dataset"
+    """Copy the run of stage 1 and play every second scene of it anew; whole or not at all."""
+    source = Path(args.repr_dir.format(**vars(args)))
+    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     if path.exists():
         fail(f"{path} exists; choose another --exp-name")
-    if not (source / "meta.json").exists():
-        fail(f"{source} does not exist; name a run of aib_repr.py with --repr-dir")
-    meta = json.loads((source / "meta.json").read_text())
-    if meta["sim_backend"] != "physx_cpu":
+    stored = ppo_baseline.load(source / "repr.pt", "name a run of aib_repr.py with --repr-dir", kind="repr")
+    if stored["sim_backend"] != "physx_cpu":
         fail(f"{source} is of physx_cuda, which draws scenes by batch; only those of physx_cpu can be played again")
-    settings = ppo_baseline.Args(env_id=args.env_id, robot=meta["robot"], robot_triangles=meta["robot_triangles"])
+    settings = ppo_baseline.Args(env_id=args.env_id, robot=stored["robot"], robot_triangles=stored["robot_triangles"])
     settings.sim_backend, settings.num_workers = "physx_cpu", args.num_workers
     ppo_baseline.check_task(settings)
     agent, envs = load_agent(args), make_envs(settings)
-    part = path.with_name("dataset.part")
+    part = path.with_name(path.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
-    shutil.copytree(source, part)
-    arrays = {file.stem: np.load(file, mmap_mode="r+") for file in part.glob("*.npy")}
+    shutil.copytree(source / "dataset", part / "dataset")
+    shutil.copy(source / "repr.pt", part)
+    arrays = {file.stem: np.load(file, mmap_mode="r+") for file in (part / "dataset").glob("*.npy")}
     steps = arrays["actions"].shape[1]
-    episodes = np.arange(1, meta["num_episodes"], 2)
+    episodes = np.arange(1, stored["num_episodes"], 2)
     torch.manual_seed(args.seed)
     bar = tqdm(total=len(episodes) * steps, desc="reaching", unit="step")
     for first in range(0, len(episodes), envs.num_envs):

@@ -115,7 +115,7 @@ def run_reach(quick_runs: Path, agent: str) -> tuple[int, str, str]:
     return run("benchmark/reach", *options, cwd=quick_runs.parent)
 
 
-def test_reach_plays_every_second_scene_anew_and_stage_1_takes_it(quick_runs: Path) -> None:
+def test_reach_plays_every_second_scene_anew_and_stage_2_takes_it(quick_runs: Path) -> None:
     agent = true_state.StateAgent(spaces([1, 1, 3], 28, 8), ppo_baseline.Args())
     content = {"kind": "ppo_baseline agent", "env_id": TASK, "agent": agent.state_dict()}
     ppo_baseline.save(quick_runs / "agents" / "target.pt", content)
@@ -124,10 +124,9 @@ def test_reach_plays_every_second_scene_anew_and_stage_1_takes_it(quick_runs: Pa
     code, out, err = run_reach(quick_runs, "runs/agents/target.pt")
     assert code == 0 and "4 episodes of reaching" in out, err
     path = quick_runs / f"{TASK}__aib_repr_quick_reach__1"
-    code, out, err = run(
-        "aib_repr", "--env-id", TASK, "--quick", "--exp-name", path.name.split("__")[1], cwd=path.parents[1]
-    )
-    assert code == 0 and (path / "repr.pt").exists(), err
+    options = ["--env-id", TASK, "--quick", "--repr-dir", f"runs/{path.name}", "--exp-name", "aib_belief_quick_reach"]
+    code, _, err = run("aib_belief", *options, cwd=quick_runs.parent)
+    assert code == 0, err
     folders = [quick_runs / f"{TASK}__aib_repr_quick__1", path]
     before, after = ({file.stem: np.load(file) for file in (x / "dataset").glob("*.npy")} for x in folders)
     assert before.keys() == after.keys()
