@@ -576,8 +576,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Build environments whose episodes all last max_episode_steps, without auto-reset.
 
     Actions lie in [-1, 1]: changes of the arm's 7 joint angles, and the gripper's opening.
-    physx_cuda: one batch of args.num_envs scenes. physx_cpu: up to args.num_workers processes of one scene each, all
-    forked from one that has imported the tasks, or spawned beside CUDA, which does not survive a fork.
+    physx_cuda: one batch of args.num_envs scenes, all drawn by the first of reset's seeds. physx_cpu: up to
+    args.num_workers processes of one scene each, all forked from one that has imported the tasks, or spawned beside
+    CUDA, which does not survive a fork.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
