@@ -473,9 +473,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
                 actor.pose = pose
         seen = {"agent": obs_dict["agent"], "tcp_pose": obs_dict["extra"].pop("tcp_pose")}
         state = common.flatten_state_dict(obs_dict["extra"], use_torch=True).float()
-        state = torch.where(
-            state.abs() > 500, 1.0, state
-        )  # a hidden object 1 m up, not 1 km, which would drown all else
+        state = torch.where(state.abs() > 500, 1.0, state)  # hidden: 1 m up, not 1 km, which would drown all else
         cue = self.task.oracle_info.float().reshape(len(state), -1)
         obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}

@@ -102,9 +102,12 @@ def main(args: Args) -> None:
     """Copy the run of stage 1 and play every second scene of it anew; whole or not at all."""
     source = Path(args.repr_dir.format(**vars(args)))
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
+    if not args.env_id.startswith(("RememberColor", "RememberShape")):
+        fail(f"--env-id {args.env_id} has no objects to reach for; choose a RememberColor or RememberShape task")
     if path.exists():
         fail(f"{path} exists; choose another --exp-name")
-    stored = ppo_baseline.load(source / "repr.pt", "name a run of aib_repr.py with --repr-dir", kind="repr")
+    hint = "name a run of aib_repr.py with --repr-dir"
+    stored = ppo_baseline.load(source / "repr.pt", hint, kind="repr", env_id=args.env_id)
     if stored["sim_backend"] != "physx_cpu":
         fail(f"{source} is of physx_cuda, which draws scenes by batch; only those of physx_cpu can be played again")
     settings = ppo_baseline.Args(env_id=args.env_id, robot=stored["robot"], robot_triangles=stored["robot_triangles"])

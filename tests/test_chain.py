@@ -148,6 +148,8 @@ def test_reach_plays_every_second_scene_anew_and_stage_2_takes_it(quick_runs: Pa
         assert np.allclose(after["state"][3, t + 1], info["state"], atol=1e-5)
         assert np.isclose(after["rewards"][3, t], reward, atol=1e-5)
     env.close()
+    code, _, err = run("benchmark/reach", "--env-id", "InterceptFast-v0", cwd=quick_runs.parent)
+    assert code == 2 and "has no objects to reach for" in err
     again, _, err = run_reach(quick_runs, "runs/agents/target.pt")
     assert again == 2 and "exists; choose another --exp-name" in err
 
