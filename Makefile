@@ -20,13 +20,14 @@ run: setup
 
 demo: setup
 	task="--env-id RememberColor3-v0 --small"
-	echo "AIB on RememberColor3-v0 in three stages, some 30 minutes on two cores with AMX (estimate), else 60 to 80; stopped, make demo resumes it"
-	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 6 minutes"
-	$(PY) aib_repr.py $$task
-	echo "stage 2 of 3: the belief, about 5 minutes"
-	$(PY) aib_belief.py $$task
-	echo "stage 3 of 3: PPO on observation and belief, about 18 minutes; curves: .venv/bin/tensorboard --logdir runs"
-	$(PY) ppo_aib.py $$task --total-timesteps 86400 --exp-name ppo_aib_demo
+	echo "AIB on RememberColor3-v0 in three stages, about 40 minutes on two cores; stopped, make demo resumes it"
+	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 10 minutes"
+	$(PY) aib_repr.py $$task --epochs 4 --exp-name aib_repr_demo
+	echo "stage 2 of 3: the belief, about 8 minutes"
+	$(PY) aib_belief.py $$task --num-updates 350 --repr-dir 'runs/{env_id}__aib_repr_demo__{seed}' --exp-name aib_belief_demo
+	echo "stage 3 of 3: PPO on observation and belief, about 22 minutes; curves: .venv/bin/tensorboard --logdir runs"
+	$(PY) ppo_aib.py $$task --total-timesteps 72000 --num-workers 8 \
+	    --belief 'runs/{env_id}__aib_belief_demo__{seed}/belief.pt' --exp-name ppo_aib_demo
 	$(PY) benchmark/report.py --runs runs
 	echo "chance level of success_once: 0.33; plain PPO stays there"
 	echo "curve: benchmark/report/learning_curves.png; videos: $$(ls -d runs/RememberColor3-v0__ppo_aib_demo__1/videos)"
