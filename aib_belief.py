@@ -67,6 +67,8 @@ class Args:
     """panda_wristcam is MIKASA-Robo's; its camera at the wrist is not used"""
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
+    image_size: int = 128
+    """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -117,7 +119,8 @@ class Args:
 
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_shift=(0, math.inf))
+LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_size=(36, math.inf))
+LIMITS |= dict(image_shift=(0, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "sim_backend", "render_backend")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
@@ -362,7 +365,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     if args.repr_dir == default and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
-    task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "num_episodes")}
+    task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "image_size", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
     stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())  # a belief is resumed on its own phi only
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
@@ -657,7 +660,7 @@ def run_stage(script: str, args: Args) -> None:
         command.append("--small")
     if args.quick:
         command.append("--quick")
-    task = ("env_id", "seed", "robot", "robot_triangles", "num_episodes")
+    task = ("env_id", "seed", "robot", "robot_triangles", "image_size", "num_episodes")
     for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)

@@ -72,6 +72,8 @@ class Args:
     """panda_wristcam is MIKASA-Robo's; its camera at the wrist is not used"""
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
+    image_size: int = 128
+    """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -116,7 +118,8 @@ class Args:
 
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), val_fraction=(0, 1), noise_beta=(0, 2))
+LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_size=(36, math.inf))
+LIMITS |= dict(val_fraction=(0, 1), noise_beta=(0, 2))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, batch_size=100, learning_rate=1e-3)
@@ -544,6 +547,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
             control_mode="pd_joint_delta_pos",
             reward_mode="normalized_dense",
             robot_uids=args.robot,
+            sensor_configs={"width": args.image_size, "height": args.image_size},
             sim_backend=args.sim_backend,
             render_backend=args.render_backend,
             reconfiguration_freq=0,  # ShellGame tasks would build the scene, with stock meshes, at every reset

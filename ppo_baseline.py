@@ -73,6 +73,8 @@ class Args:
     """panda_wristcam is MIKASA-Robo's; its camera at the wrist is not used"""
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
+    image_size: int = 128
+    """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
@@ -125,7 +127,8 @@ class Args:
 
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
+LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_size=(36, math.inf))
+LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
 LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
@@ -328,7 +331,8 @@ def evaluate_checkpoint(args: Args) -> None:
     """Evaluate the agent of --checkpoint, on test episodes; writes evaluation.json and .mp4 beside it."""
     file = Path(args.checkpoint.format(**vars(args)))
     stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_baseline agent")
-    for name in ("env_id", "robot", "robot_triangles", "num_envs", "amp"):
+    task = ("env_id", "robot", "robot_triangles", "image_size")
+    for name in (*task, "num_envs", "amp"):
         setattr(args, name, stored[name])
     check_task(args)
     envs, device = make_envs(args), torch.device(args.device)
@@ -559,6 +563,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
             control_mode="pd_joint_delta_pos",
             reward_mode="normalized_dense",
             robot_uids=args.robot,
+            sensor_configs={"width": args.image_size, "height": args.image_size},
             sim_backend=args.sim_backend,
             render_backend=args.render_backend,
             reconfiguration_freq=0,  # ShellGame tasks would build the scene, with stock meshes, at every reset
