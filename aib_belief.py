@@ -63,8 +63,6 @@ class Args:
     """physx_cpu: one process per scene; physx_cuda: all scenes as one batch on the GPU"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
-    robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """panda_wristcam is MIKASA-Robo's; its camera at the wrist is not used"""
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
@@ -365,7 +363,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     if args.repr_dir == default and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
-    task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "image_size", "num_episodes")}
+    task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
     stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())  # a belief is resumed on its own phi only
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
@@ -654,13 +652,13 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 
 
 def run_stage(script: str, args: Args) -> None:
-    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
+    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends and sizes."""
     command = [sys.executable, str(Path(__file__).with_name(script))]
     if args.small:
         command.append("--small")
     if args.quick:
         command.append("--quick")
-    task = ("env_id", "seed", "robot", "robot_triangles", "image_size", "num_episodes")
+    task = ("env_id", "seed", "robot_triangles", "image_size", "num_episodes")
     for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)

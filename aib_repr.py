@@ -68,8 +68,6 @@ class Args:
     """physx_cpu: one process per scene; physx_cuda: all scenes as one batch on the GPU"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
-    robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """panda_wristcam is MIKASA-Robo's; its camera at the wrist is not used"""
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
@@ -546,7 +544,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
             obs_mode="state_dict",
             control_mode="pd_joint_delta_pos",
             reward_mode="normalized_dense",
-            robot_uids=args.robot,
+            robot_uids="panda_wristcam",
             sensor_configs={"width": args.image_size, "height": args.image_size},
             sim_backend=args.sim_backend,
             render_backend=args.render_backend,

@@ -81,8 +81,6 @@ class Args:
     """physx_cpu: one process per scene; physx_cuda: all scenes as one batch on the GPU"""
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
-    robot: Literal["panda_wristcam", "panda"] = "panda_wristcam"
-    """panda_wristcam is MIKASA-Robo's; its camera at the wrist is not used"""
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
@@ -170,7 +168,7 @@ class Args:
     amp: bool = False
     """image networks of policy and belief in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint; task, robot, num_envs, amp and the like are those stored in it"""
+    """only evaluate --checkpoint; task, image_size, num_envs, amp and the like are those stored in it"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
@@ -457,7 +455,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     if args.repr_dir == default and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
-    task = {name: getattr(args, name) for name in ("env_id", "robot", "robot_triangles", "image_size", "num_episodes")}
+    task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
     stored = load(path / "repr.pt", hint, kind="repr", **task)
     stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())  # a belief is resumed on its own phi only
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
@@ -568,7 +566,9 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
-    rgb = buffer["rgb"][:, :4].cpu().numpy().repeat(2, axis=2).repeat(2, axis=3)
+    rgb = buffer["rgb"][:, :4].cpu().numpy()
+    scale = math.ceil(256 / rgb.shape[2])
+    rgb = rgb.repeat(scale, axis=2).repeat(scale, axis=3)
     succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
     rgb[1:, :, :8][succeeded] = (0, 255, 0)
     rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)
@@ -673,8 +673,8 @@ def evaluate_checkpoint(args: Args) -> None:
     """Evaluate the agent of --checkpoint, on test episodes; writes evaluation.json and .mp4 beside it."""
     file = Path(args.checkpoint.format(**vars(args)))
     stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_believer agent")
-    task = ("env_id", "robot", "robot_triangles", "image_size")
-    for name in (*task, "num_envs", "amp", "num_particles", "sample_decoder"):
+    task = ("env_id", "robot_triangles", "image_size", "num_envs")
+    for name in (*task, "amp", "num_particles", "sample_decoder"):
         setattr(args, name, stored[name])
     check_task(args)
     envs, device = make_envs(args), torch.device(args.device)
@@ -913,7 +913,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
             obs_mode="state_dict",
             control_mode="pd_joint_delta_pos",
             reward_mode="normalized_dense",
-            robot_uids=args.robot,
+            robot_uids="panda_wristcam",
             sensor_configs={"width": args.image_size, "height": args.image_size},
             sim_backend=args.sim_backend,
             render_backend=args.render_backend,
@@ -1056,13 +1056,13 @@ def load(path: Path, hint: str, **expected: object) -> dict:
 
 
 def run_stage(script: str, args: Args) -> None:
-    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends, robot and size."""
+    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends and sizes."""
     command = [sys.executable, str(Path(__file__).with_name(script))]
     if args.small:
         command.append("--small")
     if args.quick:
         command.append("--quick")
-    task = ("env_id", "seed", "robot", "robot_triangles", "image_size", "num_episodes")
+    task = ("env_id", "seed", "robot_triangles", "image_size", "num_episodes")
     for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)

@@ -110,7 +110,7 @@ def main(args: Args) -> None:
     stored = ppo_baseline.load(source / "repr.pt", hint, kind="repr", env_id=args.env_id)
     if stored["sim_backend"] != "physx_cpu":
         fail(f"{source} is of physx_cuda, which draws scenes by batch; only those of physx_cpu can be played again")
-    task = {name: stored[name] for name in ("env_id", "robot", "robot_triangles", "image_size")}
+    task = {name: stored[name] for name in ("env_id", "robot_triangles", "image_size")}
     settings = ppo_baseline.Args(**task)
     settings.sim_backend, settings.num_workers = "physx_cpu", args.num_workers
     ppo_baseline.check_task(settings)

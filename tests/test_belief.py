@@ -43,7 +43,7 @@ def make_stage_1(folder: Path, episodes: int) -> int:
     arrays |= {"actions": rng.uniform(-1, 1, (episodes, 10, 2)), "cue": rng.integers(3, size=(episodes, 1))}
     for name, array in arrays.items():
         np.save(path / "dataset" / f"{name}.npy", array.astype(np.float32))
-    content = {"kind": "repr", "env_id": TOY, "robot": "panda_wristcam", "robot_triangles": 500, "num_val": 8}
+    content = {"kind": "repr", "env_id": TOY, "robot_triangles": 500, "image_size": 128, "num_val": 8}
     phi, psi = aib_repr.StateEncoder(4, 4), aib_repr.ObservationEncoder([128, 128, 3], 3, 4)
     content |= {"num_episodes": episodes, "u_dim": 4, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())}
     aib_repr.save(path / "repr.pt", content)
@@ -96,7 +96,7 @@ def test_an_earlier_stage_gets_what_it_needs_to_know(monkeypatch: pytest.MonkeyP
     commands = []
     stage = SimpleNamespace(wait=lambda: 0, returncode=0)
     monkeypatch.setattr(subprocess, "Popen", lambda command, **_: commands.append(command) or stage)
-    same = dict(env_id="RememberColor3-v0", seed=3, small=True, robot="panda", robot_triangles=0, num_workers=5)
+    same = dict(env_id="RememberColor3-v0", seed=3, small=True, robot_triangles=0, image_size=40, num_workers=5)
     for module, script in ((aib_belief, "aib_repr.py"), (ppo_aib, "aib_belief.py"), (ppo_believer, "aib_repr.py")):
         module.run_stage(script, module.Args(num_episodes=77, **same))
         earlier = {"aib_repr.py": aib_repr, "aib_belief.py": aib_belief}[script]

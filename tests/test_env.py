@@ -142,7 +142,7 @@ def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:
 
 
 def test_the_ground_of_two_triangles_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    flat = aib_repr.make_task(aib_repr.Args(env_id=TASK), 1)
+    flat = aib_repr.make_task(aib_repr.Args(env_id=TASK, image_size=64), 1)
     body = flat.unwrapped.scene.actors["ground"]._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
     assert len(body.render_shapes[0].parts[0].triangles) == 2
     replace_meshes = aib_repr.replace_meshes
@@ -152,9 +152,9 @@ def test_the_ground_of_two_triangles_gives_the_same_picture(monkeypatch: pytest.
             replace_meshes(entities, meshes)
 
     monkeypatch.setattr(aib_repr, "replace_meshes", of_the_robot_only)
-    grid = aib_repr.make_task(aib_repr.Args(env_id=TASK), 1)
+    grid = aib_repr.make_task(aib_repr.Args(env_id=TASK, image_size=64), 1)
     pictures, expected = (env.reset(seed=1)[0]["rgb"].astype(int) for env in (flat, grid))
-    assert np.abs(pictures - expected).max() <= 1
+    assert pictures.shape == (64, 64, 3) and np.abs(pictures - expected).max() <= 1
     flat.close()
     grid.close()
 

@@ -111,6 +111,7 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_baseline", ["--gamma", "1.5"], ["--gamma 1.5", "between 0 and 1"]),
         ("ppo_aib", ["--small", "--quick"], ["--small and --quick exclude each other"]),
         ("ppo_baseline", ["--exp-name", "a/b"], ["--exp-name a/b", "without /"]),
+        ("ppo_aib", ["--image-size", "32"], ["--image-size 32", "at least 36"]),
         ("aib_belief", ["--image-shift", "-1"], ["--image-shift -1", "at least 0"]),
         ("aib_repr", ["--val-fraction", "1.5"], ["--val-fraction 1.5", "between 0 and 1"]),
         ("ppo_believer", ["--num-minibatches", "0"], ["--num-minibatches 0", "at least 1"]),
@@ -182,7 +183,6 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
     "dataset of another format": (aib_repr, STAGE_1, other_dataset, ["has format 9", "--overwrite"]),
     "repr.pt cut short": (aib_belief, STAGE_2, cut(REPR_PT), ["repr.pt is damaged", "--overwrite"]),
     "repr.pt of another task": (aib_belief, STAGE_2, change(REPR_PT, env_id="X-v0"), ["has env_id X-v0"]),
-    "repr.pt of another robot": (aib_belief, STAGE_2, change(REPR_PT, robot="panda"), ["has robot panda"]),
     "repr.pt of fewer episodes": (
         aib_belief,
         {**STAGE_2, "num_episodes": 30},
@@ -191,6 +191,7 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
     ),
     "belief.pt of fewer episodes": (ppo_aib, {**PPO, "num_episodes": 30}, None, ["belief.pt has num_episodes 20"]),
     "repr.pt of other meshes": (aib_belief, STAGE_2, change(REPR_PT, robot_triangles=0), ["has robot_triangles 0"]),
+    "repr.pt of other pictures": (aib_belief, STAGE_2, change(REPR_PT, image_size=64), ["has image_size 64"]),
     "named repr_dir missing": (aib_belief, {**STAGE_2, "repr_dir": "no"}, None, ["no/repr.pt does not exist"]),
     "images cut short": (aib_belief, STAGE_2, cut(DATA / "rgb.npy"), ["dataset is damaged", "--overwrite"]),
     "an array missing": (aib_belief, STAGE_2, (DATA / "cue.npy").unlink, ["dataset is damaged", "cue.npy"]),

@@ -14,11 +14,11 @@ TREES = {name: ast.parse(source) for name, source in SOURCES.items()}
 SECTIONS = ["arguments", "networks", "losses", "data", "evaluation", "training", "simulator", "files and stages"]
 OWN = ("Args", "main", "evaluate_checkpoint", "SMALL", "QUICK", "LIMITS", "MAY_DIFFER", "TASKS")
 BUDGET = {  # a reader's: tokens of code, lines, tokens a code line
-    "aib_repr": (5988, 691, 12.5),
-    "aib_belief": (5969, 678, 13.4),
-    "ppo_aib": (7475, 890, 12.0),
-    "ppo_believer": (9471, 1082, 12.5),
-    "ppo_baseline": (5898, 710, 11.8),
+    "aib_repr": (6011, 693, 12.5),
+    "aib_belief": (5978, 679, 13.4),
+    "ppo_aib": (7522, 895, 12.0),
+    "ppo_believer": (9518, 1087, 12.5),
+    "ppo_baseline": (5939, 714, 11.8),
 }
 
 
@@ -98,7 +98,7 @@ def test_every_argument_is_used_and_documented(script: str) -> None:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "args"
     }
     handed_on = {  # by name, to an earlier stage or to what reads the arguments
-        "aib_belief": {"robot", "robot_triangles", "num_workers"},
+        "aib_belief": {"robot_triangles", "image_size", "num_workers"},
         "aib_repr": set(),
         "ppo_aib": {"num_episodes"},
         "ppo_baseline": set(),
