@@ -122,7 +122,7 @@ LIMITS |= dict(image_shift=(0, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "sim_backend", "render_backend")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
-SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
+SMALL |= dict(image_size=64, repr_dir="runs/{env_id}__aib_repr_small__{seed}")
 QUICK = dict(exp_name="aib_belief_quick", num_episodes=8, num_updates=4, batch_episodes=4)
 QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 

@@ -121,7 +121,7 @@ LIMITS |= dict(val_fraction=(0, 1), noise_beta=(0, 2))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, batch_size=100, learning_rate=1e-3)
-SMALL |= dict(epochs=7, kl_coef=0.003)
+SMALL |= dict(image_size=64, epochs=7, kl_coef=0.003)
 QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_fraction=0.5, epochs=2)
 
 
