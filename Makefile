@@ -1,5 +1,5 @@
 # make run: set everything up, then train AIB on InterceptFast (a --quick trial where there is no CUDA device)
-# make demo: set everything up, then train AIB on RememberColor3, shortened from --small, and draw its curve
+# make demo: set everything up, then train AIB on RememberColor3 with --small, and draw its curve
 # make test: set everything up, then lint and run the tests
 # make test-all: all tests, with every kill of every stage and three seeds of the learning test
 # make test-gpu: the three PPO scripts' --quick on a GPU, with physics there and then on the CPU
@@ -20,17 +20,16 @@ run: setup
 
 demo: setup
 	task="--env-id RememberColor3-v0 --small"
-	echo "AIB on RememberColor3-v0 in three stages, about 40 minutes on two cores; stopped, make demo resumes it"
-	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 10 minutes"
-	$(PY) aib_repr.py $$task --epochs 4 --exp-name aib_repr_demo
-	echo "stage 2 of 3: the belief, about 8 minutes"
-	$(PY) aib_belief.py $$task --num-updates 350 --repr-dir 'runs/{env_id}__aib_repr_demo__{seed}' --exp-name aib_belief_demo
-	echo "stage 3 of 3: PPO on observation and belief, about 22 minutes; curves: .venv/bin/tensorboard --logdir runs"
-	$(PY) ppo_aib.py $$task --total-timesteps 72000 --num-workers 8 \
-	    --belief 'runs/{env_id}__aib_belief_demo__{seed}/belief.pt' --exp-name ppo_aib_demo
+	echo "AIB on RememberColor3-v0 in three stages, about 20 minutes on two cores; stopped, make demo resumes it"
+	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 4 minutes"
+	$(PY) aib_repr.py $$task
+	echo "stage 2 of 3: the belief, about 2 minutes"
+	$(PY) aib_belief.py $$task
+	echo "stage 3 of 3: PPO on observation and belief, about 14 minutes; curves: .venv/bin/tensorboard --logdir runs"
+	$(PY) ppo_aib.py $$task
 	$(PY) benchmark/report.py --runs runs
 	echo "chance level of success_once: 0.33; plain PPO stays there"
-	echo "curve: benchmark/report/learning_curves.png; videos: $$(ls -d runs/RememberColor3-v0__ppo_aib_demo__1/videos)"
+	echo "curve: benchmark/report/learning_curves.png; videos: $$(ls -d runs/RememberColor3-v0__ppo_aib_small__1/videos)"
 
 test: setup
 	$(PY) -m ruff check .

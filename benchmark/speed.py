@@ -1,7 +1,7 @@
 """How fast, as ratios measured in one run: `make bench`.
 
-A simulator's start, step and pictures against MIKASA-Robo's stock environment; steps/s of a rollout of ppo_aib.py by
-cores, and of two side by side; what of a rollout is simulator.
+A simulator's start, step and pictures against MIKASA-Robo's stock environment; the belief's network on small pictures;
+steps/s of a rollout of ppo_aib.py by cores, and of two side by side; what of a rollout is simulator.
 
 Usage:   python benchmark/speed.py
          python benchmark/speed.py --env-id InterceptFast-v0 --episodes 16
@@ -26,9 +26,11 @@ import torch
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
+import aib_belief  # noqa: E402
 import ppo_aib  # noqa: E402
 
-CONFIG = {"image_shape": [128, 128, 3], "joints_dim": 25, "state_dim": 16, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
+SIZE = 64  # of pictures, with --small
+CONFIG = {"image_shape": [SIZE, SIZE, 3], "joints_dim": 25, "state_dim": 16, "gru_layers": 1, "u_dim": 16, "z_dim": 32}
 
 
 @dataclass
@@ -39,7 +41,7 @@ class Args:
     """episodes per rollout"""
 
 
-def simulate(kind: str, env_id: str, robot: str) -> tuple[float, float, np.ndarray]:
+def simulate(kind: str, env_id: str) -> tuple[float, float, np.ndarray]:
     """CPU-seconds to build and reset one simulator, median seconds of a step, and 21 pictures (21, H, W, 3).
 
     kind: stock, MIKASA-Robo's environment; ours; heavy, ours with SAPIEN's own shaders and meshes.
@@ -48,14 +50,14 @@ def simulate(kind: str, env_id: str, robot: str) -> tuple[float, float, np.ndarr
     if kind == "stock":
         modes = dict(obs_mode="rgb", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
         backends = dict(sim_backend="physx_cpu", render_backend="sapien_cpu")
-        env = gym.make(env_id, num_envs=1, robot_uids=robot, **modes, **backends)
+        env = gym.make(env_id, num_envs=1, robot_uids="panda_wristcam", **modes, **backends)
         env = ppo_aib.wrappers.FlattenRGBDObservationWrapper(env, rgb=True, depth=False, state=True)
         env = ppo_aib.wrappers.CPUGymWrapper(env, ignore_terminations=True)
     else:
         if kind == "heavy":
             ppo_aib.shaders_without_brdf_table = nullcontext
         triangles = 500 if kind == "ours" else 0
-        env = ppo_aib.make_task(ppo_aib.Args(env_id=env_id, robot=robot, robot_triangles=triangles), 1)
+        env = ppo_aib.make_task(ppo_aib.Args(env_id=env_id, robot_triangles=triangles), 1)
     pictures, seconds, rng = [env.reset(seed=1)[0]["rgb"]], [], np.random.default_rng(0)
     start_seconds = time.process_time() - start
     for _ in range(20):
@@ -71,7 +73,7 @@ def rollout_speed(env_id: str, cores: set[int], episodes: int) -> tuple[float, f
     """Steps/s of a rollout of ppo_aib.py on given cores, and the simulator's share of its time; the faster of two."""
     os.sched_setaffinity(0, cores)
     torch.set_num_threads(len(cores))
-    args = ppo_aib.Args(env_id=env_id, num_workers=2 * len(cores))
+    args = ppo_aib.Args(env_id=env_id, num_workers=4 * len(cores), image_size=SIZE)
     envs = ppo_aib.make_envs(args)
     agent = ppo_aib.Agent(envs, ppo_aib.AIBBelief(CONFIG), args)
     inside, step = [], envs.step
@@ -94,6 +96,19 @@ def rollout_speed(env_id: str, cores: set[int], episodes: int) -> tuple[float, f
     return max(measured)
 
 
+def history_seconds(size: int) -> float:
+    """Seconds for h of 16 episodes with pictures of size x size and its gradient, on one core; the fastest of three."""
+    torch.set_num_threads(1)
+    history = aib_belief.HistoryEncoder({**CONFIG, "image_shape": [size, size, 3]})
+    batch = {"rgb": torch.zeros(61, 16, size, size, 3, dtype=torch.uint8), "joints": torch.zeros(61, 16, 25)}
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        aib_belief.encode_history(history, batch).sum().backward()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
 def afresh(function: Callable, *arguments: object) -> object:
     """What a function returns in a process of its own, with one thread for each library as in the scripts' workers."""
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE")
@@ -104,21 +119,20 @@ def afresh(function: Callable, *arguments: object) -> object:
 def rows(args: Args) -> Iterator[tuple[str, str]]:
     """Measure, and give the table row by row."""
     for env_id in ("InterceptFast-v0", "RememberColor9-v0"):
-        for robot in ("panda_wristcam", "panda"):
-            stock, ours = (afresh(simulate, kind, env_id, robot) for kind in ("stock", "ours"))
-            text = f"step {stock[1] / ours[1]:.1f} x as fast as stock ({1000 * stock[1]:.0f} / {1000 * ours[1]:.1f} ms)"
-            text += f", start {ours[0] / stock[0]:.2f} of stock's CPU time ({stock[0]:.1f} s, {ours[0]:.1f} s)"
-            yield f"one simulator, {env_id}, {robot}", text
+        stock, ours = (afresh(simulate, kind, env_id) for kind in ("stock", "ours"))
+        text = f"step {stock[1] / ours[1]:.1f} x as fast as stock ({1000 * stock[1]:.0f} / {1000 * ours[1]:.1f} ms)"
+        text += f", start {ours[0] / stock[0]:.2f} of stock's CPU time ({stock[0]:.1f} s, {ours[0]:.1f} s)"
+        yield f"one simulator, {env_id}", text
     for task in ("InterceptFast", "RememberColor9", "RememberShapeAndColor3x2", "TakeItBack", "ChainOfColors7"):
-        heavy, ours = (
-            afresh(simulate, kind, f"{task}-v0", "panda_wristcam")[2].astype(int) for kind in ("heavy", "ours")
-        )
+        heavy, ours = (afresh(simulate, kind, f"{task}-v0")[2].astype(int) for kind in ("heavy", "ours"))
         difference = np.abs(heavy - ours)
         share = (difference.max(-1) > 16).mean()
         yield (
             f"pictures, {task}",
             f"{share:.2%} of pixels differ by more than 16, mean difference {difference.mean():.2f}",
         )
+    large, small = (afresh(history_seconds, size) for size in (128, SIZE))
+    yield "belief's network, forward and backward", f"{large / small:.1f} x as fast with {SIZE} pixels as with 128"
     cores = sorted(os.sched_getaffinity(0))
     one, every = (afresh(rollout_speed, args.env_id, set(use), args.episodes) for use in (cores[:1], cores))
     yield f"rollout of AIB, {args.env_id}", f"{one[0]:.0f} steps/s on 1 core, {every[0]:.0f} on {len(cores)}"
