@@ -2,9 +2,9 @@
 
 Usage:   python benchmark/report.py                                  (README.md, docs/results.md and their figures)
          python benchmark/report.py --runs runs                      (learning curves and last values of your runs)
-         python benchmark/report.py --runs runs --add small              (append your runs to eval.csv, beliefs.csv)
-Reads:   benchmark/results/: eval.csv, beliefs.csv, paper.csv, tables.csv (which rows tables show, in order);
-         or runs/*/: args.json with eval.csv, diagnostics.json
+         python benchmark/report.py --runs runs --add small    (append your runs to eval.csv, test.csv, beliefs.csv)
+Reads:   benchmark/results/: eval.csv, test.csv, beliefs.csv, paper.csv, tables.csv (which rows tables show, in order);
+         or runs/*/: args.json with eval.csv, evaluation.json (of --evaluate), diagnostics.json
 Writes:  tables between <!-- name --> and <!-- end --> in the pages, PNG figures; or benchmark/report/
 """
 
@@ -74,12 +74,12 @@ def rows_of(table: str) -> list[tuple[str, str]]:
     return [(row["task"], row["setting"]) for row in read("tables.csv") if row["table"] == table]
 
 
-def eval_rows(folder: Path, setting: str) -> list[dict]:
-    """Rows as in eval.csv of all runs in a folder; setting "" names each by its exp_name. --quick runs are left out.
+def eval_rows(folder: Path, setting: str) -> tuple[list[dict], list[dict]]:
+    """Rows as in eval.csv and test.csv of all runs in a folder; setting "" names each by its exp_name.
 
-    The method follows from how exp_name begins; it is exp_name itself where that tells none.
+    The method follows from how exp_name begins; it is exp_name itself where that tells none. --quick runs are left out.
     """
-    rows = []
+    rows, test_rows = [], []
     for file in sorted(folder.glob("*__*__*/eval.csv")):
         args = json.loads((file.parent / "args.json").read_text())
         if args["quick"]:
@@ -88,9 +88,16 @@ def eval_rows(folder: Path, setting: str) -> list[dict]:
         method = next((method for start, method in (METHODS | ORACLES).items() if name.startswith(start)), name)
         run = {"task": args["env_id"], "method": method, "seed": args["seed"], "setting": setting or name}
         for row in csv.DictReader(file.open()):
-            metrics = {name: f"{float(row[name]):.4f}" for name in METRICS if name in row}
-            rows.append({**run, "step": row["global_step"], **metrics})
-    return rows
+            rows.append({**run, "step": row["global_step"], **rounded(row)})
+        test = file.with_name("evaluation.json")
+        if test.exists():
+            test_rows.append({**run, "step": rows[-1]["step"], **rounded(json.loads(test.read_text()))})
+    return rows, test_rows
+
+
+def rounded(row: dict) -> dict[str, str]:
+    """The metrics of an evaluation."""
+    return {name: f"{float(row[name]):.4f}" for name in METRICS if name in row}
 
 
 def belief_rows(folder: Path, setting: str) -> list[dict]:
@@ -167,8 +174,8 @@ def results_table(evals: list[dict]) -> str:
     return markdown(head, rows)
 
 
-def agents_table(evals: list[dict]) -> str:
-    """Agents with pictures: success_once and success_at_end."""
+def agents_table(evals: list[dict], tests: list[dict]) -> str:
+    """Agents with pictures: success_once and success_at_end; the last agents' on test episodes."""
     rows = []
     repr_arguments = {row["setting"]: row["aib_repr"] for row in read("settings.csv")}
     for task, setting in rows_of("agents"):
@@ -182,9 +189,12 @@ def agents_table(evals: list[dict]) -> str:
             length = 90 if task.startswith("Intercept") else 60
             random_steps = length * int(episodes[1] if episodes else 640) if method != "PPO" else 0
             cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
+            for metric in METRICS[:2]:
+                cells.append(summarise([values[-1] for _, values in by_seed(tests, metric, **chosen).values()]))
             run = [setting, ", ".join(curves), f"{random_steps:,}", f"{steps:,.0f}"]
             rows.append([task.removesuffix("-v0"), method, *run, *cells])
-    return markdown(["task", "method", "setting", "seeds", "random steps", "PPO steps", *METRICS[:2]], rows)
+    head = ["task", "method", "setting", "seeds", "random steps", "PPO steps", *METRICS[:2], "test: once", "at end"]
+    return markdown(head, rows)
 
 
 def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str) -> str:
@@ -335,7 +345,8 @@ def replace_tables(page: str, tables: dict[str, str]) -> str:
 def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
     evals, beliefs = read("eval.csv"), read("beliefs.csv")
-    tables = {"results": results_table(evals), "agents": agents_table(evals), "beliefs": beliefs_table(beliefs)}
+    tables = {"results": results_table(evals), "agents": agents_table(evals, read("test.csv"))}
+    tables |= {"beliefs": beliefs_table(beliefs)}
     tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "shift": shift_table(evals)}
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
@@ -372,7 +383,7 @@ def own_runs(evals: list[dict], task: str) -> str:
 
 def report_runs(args: Args) -> None:
     """Tables and learning curves of a folder of runs, a row and a curve per exp_name."""
-    evals, beliefs = eval_rows(args.runs, ""), belief_rows(args.runs, "")
+    (evals, _), beliefs = eval_rows(args.runs, ""), belief_rows(args.runs, "")
     tasks = sorted({row["task"] for row in evals})
     if not tasks:
         fail(f"no eval.csv of a run without --quick below {args.runs}; name the folder of run directories with --runs")
@@ -398,7 +409,8 @@ def main(args: Args) -> None:
     elif args.add:
         if args.add not in [row["setting"] for row in read("settings.csv")]:
             fail(f"benchmark/results/settings.csv has no --add {args.add}; describe that setting there first")
-        append("eval.csv", KEY + METRICS, eval_rows(args.runs, args.add))
+        for name, rows in zip(("eval.csv", "test.csv"), eval_rows(args.runs, args.add), strict=True):
+            append(name, KEY + METRICS, rows)
         append("beliefs.csv", [*KEY, "metric", "value"], belief_rows(args.runs, args.add))
     else:
         report_runs(args)

@@ -68,8 +68,10 @@ def test_five_seeds_have_a_bootstrap_interval() -> None:
 
 def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     record(tmp_path, "ppo_aib_small", 3, [0.25, 0.5])
+    (tmp_path / f"{TASK}__ppo_aib_small__3" / "evaluation.json").write_text('{"success_once": 0.75, "u_r2": 0.5}')
     monkeypatch.setattr(report, "RESULTS", tmp_path)
-    (tmp_path / "eval.csv").write_text(",".join(report.KEY + report.METRICS) + "\n")
+    for name in ("eval.csv", "test.csv"):
+        (tmp_path / name).write_text(",".join(report.KEY + report.METRICS) + "\n")
     (tmp_path / "beliefs.csv").write_text(",".join([*report.KEY, "metric", "value"]) + "\n")
     (tmp_path / "settings.csv").write_text("setting,aib_repr,aib_belief,ppo,note\n")
     with pytest.raises(SystemExit):
@@ -86,6 +88,8 @@ def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.Monke
         "u_r2": "",
         "u_r2_at_end": "",
     }
+    (test,) = report.read("test.csv")
+    assert (test["setting"], test["step"], test["success_once"]) == ("pink noise", "2000", "0.7500")
 
 
 def test_pages_and_figures_are_those_of_the_data(tmp_path: Path) -> None:
@@ -101,7 +105,7 @@ def test_pages_and_figures_are_those_of_the_data(tmp_path: Path) -> None:
 
 def test_every_setting_of_the_results_is_explained() -> None:
     explained = {row["setting"] for row in report.read("settings.csv")}
-    used = {row["setting"] for name in ("eval.csv", "beliefs.csv") for row in report.read(name)}
+    used = {row["setting"] for name in ("eval.csv", "test.csv", "beliefs.csv") for row in report.read(name)}
     assert used == explained
     for row in report.read("settings.csv"):
         for script in ("aib_repr", "aib_belief"):
@@ -110,7 +114,7 @@ def test_every_setting_of_the_results_is_explained() -> None:
 
 
 def test_rows_of_the_results_are_unique() -> None:
-    for name, key in (("eval.csv", report.KEY), ("beliefs.csv", [*report.KEY, "metric"])):
+    for name, key in (("eval.csv", report.KEY), ("test.csv", report.KEY), ("beliefs.csv", [*report.KEY, "metric"])):
         with (ROOT / "benchmark" / "results" / name).open() as file:
             rows = [tuple(row[column] for column in key) for row in csv.DictReader(file)]
         assert len(rows) == len(set(rows))
