@@ -91,7 +91,10 @@ def load_agent(args: Args) -> StateAgent:
     if joints.shape != (25 + 3,):
         fail(f"{file} sees other things than joints and a position; {hint}")
     actions = gym.spaces.Box(-1, 1, weights["log_std"].shape)
-    spaces = SimpleNamespace(single_observation_space={"joints": joints}, single_action_space=actions)
+    spaces = SimpleNamespace(
+        single_observation_space={"rgb": gym.spaces.Box(0, 255, (1, 1, 3)), "joints": joints},
+        single_action_space=actions,
+    )
     agent = StateAgent(spaces, ppo_baseline.Args())
     agent.load_state_dict(weights)
     return agent

@@ -88,6 +88,12 @@ def test_the_batch_of_physx_cuda_is_played_and_recorded(
 
 
 def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.Env) -> None:
+    shown = true_state.ShowState(env, pictures=True)
+    obs, _ = shown.reset(seed=3)
+    agent = true_state.StateAgent(spaces([128, 128, 3], len(obs["joints"]), 8), ppo_baseline.Args())
+    pictures = {"rgb": torch.from_numpy(np.stack([obs["rgb"], 255 - obs["rgb"]]))}
+    _, value = agent({**pictures, "joints": torch.zeros(2, len(obs["joints"]))})
+    assert value[0] != value[1], "it sees the picture"
     shown = true_state.ShowState(env)
     for obs, *_, info in (shown.reset(seed=3), shown.step(np.zeros(8, np.float32))):
         assert obs in shown.observation_space and obs["rgb"].shape == (1, 1, 3)
