@@ -102,6 +102,8 @@ class Args:
     """weight of the entropy bonus"""
     vf_coef: float = 0.5
     """weight of the value loss"""
+    reward_scale: float = 1.0
+    """factor on the rewards in training, as in ManiSkill's PPO; it weighs the value loss against the policy loss"""
     max_grad_norm: float = 0.5
     """largest norm of the gradient"""
     target_kl: float = 0.05
@@ -126,7 +128,7 @@ class Args:
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_size=(36, math.inf))
-LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
+LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2), reward_scale=(0.001, math.inf))
 LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
@@ -134,7 +136,7 @@ TASKS = {  # Table 5; all other tasks get the defaults above, which are Intercep
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
 SMALL = dict(exp_name="ppo_baseline_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
-SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, joints_norm=True)
+SMALL |= dict(gamma=0.95, target_kl=0.1, reward_scale=20.0, init_std=0.3, noise_beta=0.7, joints_norm=True)
 SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
 QUICK = dict(exp_name="ppo_baseline_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
 
@@ -381,10 +383,9 @@ def main(args: Args) -> None:
         buffer = rollout(envs, agent, args, seeds)
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
         scalars["charts/episodic_return"] = scalars["train/return"]
-        scalars["time/rollout"] = time.time() - start
 
         values = buffer.pop("values")
-        buffer["advantages"] = compute_gae(buffer["rewards"], values, args.gamma, args.gae_lambda)
+        buffer["advantages"] = compute_gae(args.reward_scale * buffer["rewards"], values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
         applied = []  # losses of the minibatches that led to an optimizer step
@@ -406,7 +407,6 @@ def main(args: Args) -> None:
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
-        scalars["time/update"] = time.time() - start - scalars["time/rollout"]
         scalars["charts/SPS"] = per_iteration / (time.time() - start)
         if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
             agent.joints_norm.train()

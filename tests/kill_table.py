@@ -90,7 +90,7 @@ def curves(folder: Path) -> dict[str, list]:
     for part in (folder, folder / "belief_events"):  # Believer's belief has its own
         events = EventAccumulator(str(part)).Reload() if part.exists() else None
         for tag in events.Tags()["scalars"] if events else ():
-            if not tag.startswith(("time/", "charts/")):
+            if not tag.startswith("charts/"):
                 found[tag] = [(row.step, repr(row.value)) for row in events.Scalars(tag)]  # nan too is equal to nan
     return found
 

@@ -72,7 +72,7 @@ def test_results(quick_runs: Path, script: str) -> None:
         "losses/approx_kl",
     }
     tags |= {"train/success_once", "eval/success_once", "eval/success_at_end", "eval/return"}
-    tags |= {"time/rollout", "time/update"} | {f"eval/{name}" for name in of_belief}
+    tags |= {f"eval/{name}" for name in of_belief}
     assert tags <= set(events.Tags()["scalars"])
     video = iio.imread(sorted((path / "videos").iterdir())[-1])
     assert video.shape == (60, 256, 512, 3) and np.abs(video[0].astype(int) - video[-1]).mean() > 1

@@ -99,6 +99,23 @@ def test_joints_are_standardised_by_the_iterations_played_so_far(
     assert max(first_kl) < 1e-6, "statistics change between iterations, not within"
 
 
+@pytest.mark.parametrize("script", METHODS)
+def test_reward_scale_is_a_factor_on_the_rewards_of_training_alone(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    module, scaled = SCRIPTS[script], []
+    compute_gae = module.compute_gae
+
+    def noted_gae(rewards: torch.Tensor, *args: object) -> torch.Tensor:
+        scaled.append(rewards.sum(0).mean().item())
+        return compute_gae(rewards, *args)
+
+    monkeypatch.setattr(module, "compute_gae", noted_gae)
+    events = EventAccumulator(str(train(module, **small(module, toy_stages, reward_scale=20.0)))).Reload()
+    returns = [event.value for event in events.Scalars("train/return")]
+    assert scaled == pytest.approx([20 * value for value in returns]) and min(returns) > 0
+
+
 def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path) -> None:
     agent, data = play(toy_stages)
     batch = {name: x[:10].flatten(0, 1) for name, x in data.items()}
