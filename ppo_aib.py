@@ -118,8 +118,8 @@ class Args:
     """weight of the entropy bonus"""
     vf_coef: float = 0.5
     """weight of the value loss"""
-    reward_scale: float = 1.0
-    """factor on the rewards in training, as in ManiSkill's PPO; it weighs the value loss against the policy loss"""
+    reward_norm: bool = False
+    """divide rewards in training by the running standard deviation of their discounted sums"""
     max_grad_norm: float = 0.5
     """largest norm of the gradient"""
     target_kl: float = 0.05
@@ -144,7 +144,7 @@ class Args:
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_size=(36, math.inf))
-LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2), reward_scale=(0.001, math.inf))
+LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
 LIMITS |= dict(init_std=(0.001, math.inf), target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
@@ -152,7 +152,7 @@ TASKS = {  # Table 5; all other tasks get the defaults above, which are Intercep
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
 SMALL = dict(exp_name="ppo_aib_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
-SMALL |= dict(gamma=0.95, target_kl=0.1, reward_scale=20.0, init_std=0.3, noise_beta=0.7, joints_norm=True)
+SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, reward_norm=True, joints_norm=True)
 SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64)
 SMALL |= dict(amp=BFLOAT16, num_episodes=640, belief="runs/{env_id}__aib_belief_small__{seed}/belief.pt")
 QUICK = dict(exp_name="ppo_aib_quick", num_episodes=8, total_timesteps=360, num_envs=2, num_eval_episodes=2)
@@ -528,6 +528,7 @@ def main(args: Args) -> None:
     agent.belief.load_state_dict(stored["belief"])
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     completed, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
+    reward_var = checkpoint.get("reward_var", 0.0)
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
@@ -545,7 +546,12 @@ def main(args: Args) -> None:
         scalars["charts/episodic_return"] = scalars["train/return"]
 
         values = buffer.pop("values")
-        buffer["advantages"] = compute_gae(args.reward_scale * buffer["rewards"], values, args.gamma, args.gae_lambda)
+        rewards = buffer["rewards"]
+        if args.reward_norm:  # as gymnasium's NormalizeReward; compute_gae gives the discounted sums
+            sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
+            reward_var += (sums.var().item() - reward_var) / iteration  # mean of all iterations'
+            rewards = rewards / (reward_var + 1e-8) ** 0.5
+        buffer["advantages"] = compute_gae(rewards, values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
         applied = []  # losses of the minibatches that led to an optimizer step
@@ -590,7 +596,7 @@ def main(args: Args) -> None:
         for name, value in scalars.items():
             writer.add_scalar(name, value, global_step)
         writer.flush()
-        states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()}
+        states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "reward_var": reward_var}
         save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": evals, **states})
         bar.update(per_iteration)
     bar.close()

@@ -10,7 +10,8 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 ROOT = Path(__file__).parent.parent
-PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num_workers=3, joints_norm=True)
+PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num_workers=3)
+PPO |= dict(joints_norm=True, reward_norm=True)
 SIZES = {
     "aib_repr": dict(num_episodes=12, val_fraction=0.34, epochs=3, batch_size=30, num_workers=2),
     "aib_belief": dict(

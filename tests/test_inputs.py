@@ -105,7 +105,6 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
         ("ppo_baseline", ["--noise-beta", "-0.1"], ["--noise-beta -0.1", "between 0 and 2"]),
         ("ppo_baseline", ["--num-eval-episodes", "1"], ["--num-eval-episodes 1 must be at least 2"]),
-        ("ppo_believer", ["--reward-scale", "0"], ["--reward-scale 0.0", "at least 0.001"]),
         ("ppo_aib", ["--noise-beta", "2.5"], ["--noise-beta 2.5", "between 0 and 2"]),
         ("ppo_believer", ["--noise-beta", "nan"], ["--noise-beta nan"]),
         ("aib_repr", ["--noise-beta", "3"], ["--noise-beta 3.0", "between 0 and 2"]),

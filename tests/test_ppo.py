@@ -100,20 +100,32 @@ def test_joints_are_standardised_by_the_iterations_played_so_far(
 
 
 @pytest.mark.parametrize("script", METHODS)
-def test_reward_scale_is_a_factor_on_the_rewards_of_training_alone(
+def test_rewards_are_divided_by_the_running_std_of_their_discounted_sums(
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
 ) -> None:
-    module, scaled = SCRIPTS[script], []
-    compute_gae = module.compute_gae
+    module, trained_on, played = SCRIPTS[script], [], []
+    compute_gae, rollout = module.compute_gae, module.rollout
 
-    def noted_gae(rewards: torch.Tensor, *args: object) -> torch.Tensor:
-        scaled.append(rewards.sum(0).mean().item())
-        return compute_gae(rewards, *args)
+    def noted_gae(rewards: torch.Tensor, values: torch.Tensor, gamma: float, gae_lambda: float) -> torch.Tensor:
+        if gae_lambda < 1:
+            trained_on.append(rewards)
+        return compute_gae(rewards, values, gamma, gae_lambda)
+
+    def noted_rollout(*args: object, deterministic: bool = False) -> dict:
+        data = rollout(*args, deterministic=deterministic)
+        if not deterministic:
+            played.append(data["rewards"])
+        return data
 
     monkeypatch.setattr(module, "compute_gae", noted_gae)
-    events = EventAccumulator(str(train(module, **small(module, toy_stages, reward_scale=20.0)))).Reload()
-    returns = [event.value for event in events.Scalars("train/return")]
-    assert scaled == pytest.approx([20 * value for value in returns]) and min(returns) > 0
+    monkeypatch.setattr(module, "rollout", noted_rollout)
+    train(module, **small(module, toy_stages, reward_norm=True, gamma=0.9))
+    variances = []
+    for rewards in played:
+        sums = [sum(0.9 ** (k - t) * rewards[k] for k in range(t, len(rewards))) for t in range(len(rewards))]
+        variances.append(torch.stack(sums).var())
+    assert torch.allclose(trained_on[0], played[0] / variances[0].sqrt(), rtol=1e-4)
+    assert torch.allclose(trained_on[1], played[1] / ((variances[0] + variances[1]) / 2).sqrt(), rtol=1e-4)
 
 
 def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path) -> None:
