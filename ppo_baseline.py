@@ -76,7 +76,7 @@ class Args:
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
     small: bool = False
-    """a reduced setting for a CPU and twenty minutes; tuned on RememberColor3-v0, seed 1"""
+    """a reduced setting for a CPU and half an hour; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -135,7 +135,7 @@ TASKS = {  # Table 5; all other tasks get the defaults above, which are Intercep
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
-SMALL = dict(exp_name="ppo_baseline_small", total_timesteps=72_000, num_envs=16, num_minibatches=8, update_epochs=8)
+SMALL = dict(exp_name="ppo_baseline_small", total_timesteps=100_800, num_envs=16, num_minibatches=8, update_epochs=8)
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, reward_norm=True, joints_norm=True)
 SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
 QUICK = dict(exp_name="ppo_baseline_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
@@ -354,7 +354,7 @@ def main(args: Args) -> None:
     if args.num_minibatches > per_iteration:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
     if args.total_timesteps > 1_000_000 and not CUDA:
-        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes twenty minutes", flush=True)
+        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes half an hour", flush=True)
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
     checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
