@@ -385,8 +385,7 @@ def main(args: Args) -> None:
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
         scalars["charts/episodic_return"] = scalars["train/return"]
 
-        values = buffer.pop("values")
-        rewards = buffer["rewards"]
+        values, rewards = buffer.pop("values"), buffer["rewards"]
         if args.reward_norm:  # as gymnasium's NormalizeReward; compute_gae gives the discounted sums
             sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
             reward_var += (sums.var().item() - reward_var) / iteration  # mean of all iterations'
@@ -408,8 +407,7 @@ def main(args: Args) -> None:
                 applied.append({name: x.detach() for name, x in losses.items()})
             if stop:
                 break
-        for name in losses:
-            # of the minibatch that ended the update, if there was no step before it
+        for name in losses:  # of the minibatch that ended the update, if there was no step before it
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
