@@ -135,7 +135,7 @@ TASKS = {  # Table 5; all other tasks get the defaults above, which are Intercep
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
-SMALL = dict(exp_name="ppo_baseline_small", total_timesteps=100_800, num_envs=16, num_minibatches=8, update_epochs=8)
+SMALL = dict(exp_name="ppo_baseline_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, reward_norm=True, joints_norm=True)
 SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
 QUICK = dict(exp_name="ppo_baseline_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
