@@ -113,6 +113,14 @@ def test_every_setting_of_the_results_is_explained() -> None:
         tyro.cli(SCRIPTS["ppo_aib"].Args, args=shlex.split(row["ppo"]))
 
 
+def test_every_result_is_in_a_table_or_quoted() -> None:
+    named = {(row["task"], row["setting"]) for row in report.read("tables.csv")}
+    used = {
+        (row["task"], row["setting"]) for name in ("eval.csv", "test.csv", "beliefs.csv") for row in report.read(name)
+    }
+    assert used <= named  # table "text": quoted in docs/results.md
+
+
 def test_rows_of_the_results_are_unique() -> None:
     for name, key in (("eval.csv", report.KEY), ("test.csv", report.KEY), ("beliefs.csv", [*report.KEY, "metric"])):
         with (ROOT / "benchmark" / "results" / name).open() as file:
