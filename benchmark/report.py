@@ -40,7 +40,7 @@ CHANCE = {  # one of so many objects is the right one
     "RememberColor9-v0": 1 / 9,
     "RememberShapeAndColor3x2-v0": 1 / 6,
 }
-HEAD_SETTING = "2000 episodes, 700 updates, kl_coef 0.003"
+HEAD_SETTING = "128 px, 2000 episodes, 700 updates"
 ORACLE_STEPS = (28800, 57600, 86400, 115200, 144000, 240000)
 
 
@@ -251,14 +251,14 @@ def oracle_table(evals: list[dict]) -> str:
 def shift_table(evals: list[dict]) -> str:
     """R² of u at the last step of the agents' own episodes: first evaluation, lowest, last; and success at the last."""
     rows = []
-    runs = sorted({(row["task"], row["method"], row["setting"]) for row in evals if row["u_r2_at_end"]})
-    for task, method, setting in runs:
-        chosen = {"task": task, "method": method, "setting": setting}
-        success = by_seed(evals, "success_once", **chosen)
-        for seed, (steps, known) in by_seed(evals, "u_r2_at_end", **chosen).items():
-            cells = [seed, f"{steps[-1]:,.0f}"]
-            cells += [f"{value:.2f}" for value in (known[0], known.min(), known[-1], success[seed][1][-1])]
-            rows.append([task.removesuffix("-v0"), method, setting, *cells])
+    for task, setting in rows_of("agents"):
+        for method in METHODS.values():
+            chosen = {"task": task, "method": method, "setting": setting}
+            success = by_seed(evals, "success_once", **chosen)
+            for seed, (steps, known) in by_seed(evals, "u_r2_at_end", **chosen).items():
+                cells = [seed, f"{steps[-1]:,.0f}"]
+                cells += [f"{value:.2f}" for value in (known[0], known.min(), known[-1], success[seed][1][-1])]
+                rows.append([task.removesuffix("-v0"), method, setting, *cells])
     head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, first", "lowest", "last", "success_once, last"]
     return markdown(head, rows)
 
@@ -315,7 +315,7 @@ def learning_curves(evals: list[dict], path: Path) -> None:
 
 def belief_figure(beliefs: list[dict], path: Path) -> None:
     """Cue and R² of u from the mean particle by time step: action heads and Believer at the same setting."""
-    columns = [("RememberColor3-v0", "640 episodes, 600 updates, kl_coef 0.01, unclipped")]
+    columns = [("RememberColor3-v0", "128 px, 640 episodes, 600 updates, kl_coef 0.01, no gradient clipping")]
     columns += [("RememberShapeAndColor3x2-v0", HEAD_SETTING), ("InterceptFast-v0", HEAD_SETTING)]
     figure, axes = plt.subplots(2, 3, figsize=(12, 5.5), layout="constrained", sharex="col")
     metrics = {"cue_from_particle": "cue", "u_r2_prior": "R² of u"}
