@@ -408,6 +408,7 @@ def main(args: Args) -> None:
             val_batch = transitions(np.random.default_rng(0).choice(val_inds, min(1000, len(val_inds)), replace=False))
             val_losses = repr_losses(model, val_batch, args)
             active = (phi(val_batch["state"]).mean.std(0) > 0.1).sum()
+        bar.set_postfix(held_out_reward=f"{val_losses['reward']:.2f}")
         update = (epoch + 1) * per_epoch
         writer.add_scalar("held_out/active_dimensions", active, update)  # of u; the others have collapsed
         for name, loss in losses.items():
