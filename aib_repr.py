@@ -104,13 +104,13 @@ class Args:
     obs_coef: float = 0.03
     """lambda_o"""
     kl_coef: float = 0.01
-    """lambda_KL; 0.03, the paper's, can drop the cue from u"""
+    """lambda_KL; with 0.03, the paper's, u is more compact and may hold less of the cue"""
     reward_norm: bool = True
     """standardise rewards; without it the reward term of a random policy is next to nothing"""
     kl_reduction: Literal["sum", "mean"] = "sum"
     """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
     psi_images: bool = True
-    """psi sees image and joints, as in the paper; without images a CPU is many times faster, and the belief worse"""
+    """psi sees image and joints, as in the paper; without images a CPU is many times faster"""
     amp: bool = BFLOAT16
     """image network in bfloat16"""
 
