@@ -174,11 +174,11 @@ def results_table(evals: list[dict]) -> str:
     return markdown(head, rows)
 
 
-def agents_table(evals: list[dict], tests: list[dict]) -> str:
+def agents_table(table: str, evals: list[dict], tests: list[dict]) -> str:
     """Agents with pictures: success_once and success_at_end; the last agents' on test episodes."""
     rows = []
     repr_arguments = {row["setting"]: row["aib_repr"] for row in read("settings.csv")}
-    for task, setting in rows_of("agents"):
+    for task, setting in rows_of(table):
         for method in METHODS.values():
             chosen = {"task": task, "method": method, "setting": setting}
             curves = by_seed(evals, "success_once", **chosen)
@@ -251,7 +251,7 @@ def oracle_table(evals: list[dict]) -> str:
 def shift_table(evals: list[dict]) -> str:
     """R² of u at the last step of the agents' own episodes: first evaluation, lowest, last; and success at the last."""
     rows = []
-    for task, setting in rows_of("agents"):
+    for task, setting in rows_of("agents") + rows_of("choices"):
         for method in METHODS.values():
             chosen = {"task": task, "method": method, "setting": setting}
             success = by_seed(evals, "success_once", **chosen)
@@ -345,8 +345,8 @@ def replace_tables(page: str, tables: dict[str, str]) -> str:
 def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
     evals, beliefs = read("eval.csv"), read("beliefs.csv")
-    tables = {"results": results_table(evals), "agents": agents_table(evals, read("test.csv"))}
-    tables |= {"beliefs": beliefs_table(beliefs)}
+    tables = {name: agents_table(name, evals, read("test.csv")) for name in ("agents", "choices")}
+    tables |= {"results": results_table(evals), "beliefs": beliefs_table(beliefs)}
     tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "shift": shift_table(evals)}
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
