@@ -177,7 +177,7 @@ def results_table(evals: list[dict]) -> str:
 def agents_table(table: str, evals: list[dict], tests: list[dict]) -> str:
     """Agents with pictures: success_once and success_at_end; the last agents' on test episodes."""
     rows = []
-    repr_arguments = {row["setting"]: row["aib_repr"] for row in read("settings.csv")}
+    before = {row["setting"]: row["steps_before_ppo"] for row in read("settings.csv")}
     for task, setting in rows_of(table):
         for method in METHODS.values():
             chosen = {"task": task, "method": method, "setting": setting}
@@ -185,15 +185,13 @@ def agents_table(table: str, evals: list[dict], tests: list[dict]) -> str:
             if not curves:
                 continue
             steps = min(curve[0][-1] for curve in curves.values())
-            episodes = re.search(r"--num-episodes (\d+)", repr_arguments[setting])
-            length = 90 if task.startswith("Intercept") else 60
-            random_steps = length * int(episodes[1] if episodes else 640) if method != "PPO" else 0
+            steps_before = 0 if method == "PPO" else int(before[setting])
             cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
             for metric in METRICS[:2]:
                 cells.append(summarise([values[-1] for _, values in by_seed(tests, metric, **chosen).values()]))
-            run = [setting, ", ".join(curves), f"{random_steps:,}", f"{steps:,.0f}"]
+            run = [setting, ", ".join(curves), f"{steps_before:,}", f"{steps:,.0f}"]
             rows.append([task.removesuffix("-v0"), method, *run, *cells])
-    head = ["task", "method", "setting", "seeds", "random steps", "PPO steps", *METRICS[:2], "test: once", "at end"]
+    head = ["task", "method", "setting", "seeds", "steps before", "PPO steps", *METRICS[:2], "test: once", "at end"]
     return markdown(head, rows)
 
 
@@ -212,7 +210,7 @@ def beliefs_table(beliefs: list[dict]) -> str:
             cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
         chance = by_seed(beliefs, "value", task=task, setting=setting, metric="cue_chance")
         rows.append([task.removesuffix("-v0"), setting, f"{next(iter(chance.values()))[1][0]:.2f}", *cells])
-    return markdown(["task", "setting", "chance", "cue from u", "cue from h", "cue from particles", "R² of u"], rows)
+    return markdown(["task", "setting", "chance of the cue", "cue from u", "cue from h", "cue from particles", "R² of u"], rows)
 
 
 def heads_table(beliefs: list[dict]) -> str:
