@@ -210,7 +210,8 @@ def beliefs_table(beliefs: list[dict]) -> str:
             cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
         chance = by_seed(beliefs, "value", task=task, setting=setting, metric="cue_chance")
         rows.append([task.removesuffix("-v0"), setting, f"{next(iter(chance.values()))[1][0]:.2f}", *cells])
-    return markdown(["task", "setting", "chance of the cue", "cue from u", "cue from h", "cue from particles", "R² of u"], rows)
+    head = ["task", "setting", "chance of the cue", "cue from u", "cue from h", "cue from particles", "R² of u"]
+    return markdown(head, rows)
 
 
 def heads_table(beliefs: list[dict]) -> str:

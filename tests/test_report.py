@@ -73,11 +73,12 @@ def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.Monke
     for name in ("eval.csv", "test.csv"):
         (tmp_path / name).write_text(",".join(report.KEY + report.METRICS) + "\n")
     (tmp_path / "beliefs.csv").write_text(",".join([*report.KEY, "metric", "value"]) + "\n")
-    (tmp_path / "settings.csv").write_text("setting,aib_repr,aib_belief,ppo,steps_before_ppo,note\n")
+    head = "setting,aib_repr,aib_belief,ppo,steps_before_ppo,note\n"
+    (tmp_path / "settings.csv").write_text(head)
     with pytest.raises(SystemExit):
         report.main(report.Args(runs=tmp_path, add="pink noise"))
     assert report.read("eval.csv") == []
-    (tmp_path / "settings.csv").write_text("setting,aib_repr,aib_belief,ppo,steps_before_ppo,note\npink noise,,,--noise-beta 1,,\n")
+    (tmp_path / "settings.csv").write_text(head + "pink noise,,,--noise-beta 1,,\n")
     report.main(report.Args(runs=tmp_path, add="pink noise"))
     rows = report.read("eval.csv")
     assert [row["success_once"] for row in rows] == ["0.2500", "0.5000"]
