@@ -405,23 +405,24 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
     """What the belief makes of episodes index (E,).
 
     h (E, T+1, 256); u (E, T+1, u_dim), actions (E, T, A), cue (E, K) as they were
-    z, z_mean (E, T+1, z_dim): sample and mean of q(z|u,h)
+    z_mean (E, T+1, z_dim): mean of q(z|u,h)
     u_prior (E, T+1, u_dim): mean of 30 particles, decoded samples of p(z|h); u_posterior: z_mean decoded
-    nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: a belief that knows of
-    three possible places is right about each; nll_posterior (E, T+1): -log p(u|z,h) under z
+    nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: low also where the
+    samples lie at several possible places, one of them u's; nll_posterior (E, T+1): -log p(u|z,h) with z ~ q(z|u,h)
     """
     torch.manual_seed(0)  # the same noise at every validation
     parts = []
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
         u, h = batch["u"], encode_history(belief.history, batch)
-        nll, _, z, mean = elbo_terms(belief, posterior, u, h)
-        decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, mean.shape[-1], device=h.device))
+        nll, _, _, mean = elbo_terms(belief, posterior, u, h)
+        num_particles = 30
+        decoded = belief.decode(h, torch.randn(*h.shape[:-1], num_particles, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
-        part = {"h": h, "u": u, "actions": batch["actions"], "z": z, "z_mean": mean}
+        part = {"h": h, "u": u, "actions": batch["actions"], "z_mean": mean}
         part["u_prior"] = decoded.mean.mean(-2)
         part["u_posterior"] = belief.decoder(torch.cat([mean, h], -1)).mean
-        part["nll_prior"] = math.log(30) - log_p.logsumexp(-1)
+        part["nll_prior"] = math.log(num_particles) - log_p.logsumexp(-1)
         part["nll_posterior"] = nll
         part = {name: x.transpose(0, 1) for name, x in part.items()}
         part["cue"] = batch["cue"]
@@ -480,12 +481,18 @@ def main(args: Args) -> None:
     episodes, stored = load_episodes(args)
     open_run(path, args)
     # of the held-out episodes, linear probes are fitted on one half and tested on the other
-    train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-stored["num_val"], -(stored["num_val"] // 2)])
+    inds, num_val = np.arange(args.num_episodes), stored["num_val"]
+    train, fit_on, test_on = inds[:-num_val], inds[-num_val : -(num_val // 2)], inds[-(num_val // 2) :]
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
-    config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
-    config["joints_dim"] = sample["joints"].shape[-1] if args.history_joints else 0
-    config |= {"state_dim": len(stored["phi"]["mean"]), "u_dim": stored["u_dim"]}
+    config = {
+        "image_shape": list(sample["rgb"].shape[2:]),
+        "joints_dim": sample["joints"].shape[-1] if args.history_joints else 0,
+        "state_dim": len(stored["phi"]["mean"]),
+        "gru_layers": args.gru_layers,
+        "u_dim": stored["u_dim"],
+        "z_dim": args.z_dim,
+    }
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": AIBBelief(config, args.belief_amp)})
     # posterior and head serve training alone: belief.pt goes without them
@@ -549,8 +556,6 @@ def main(args: Args) -> None:
     report = probe_belief(fit, test)
     if args.action_head == "flow":
         report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["actions"])
-        sampled = flow_gain(model["head"], test["z"], test["actions"])
-        report["flow_loss_sampled"], report["flow_gain_sampled"] = sampled
     writer.close()
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
     content = {"kind": "aib_belief", **asdict(args), "config": config}
@@ -560,7 +565,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
-# the same in every script
+# what a script has of these is the same in all
 
 
 def fail(message: str) -> NoReturn:

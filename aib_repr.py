@@ -257,7 +257,7 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> d
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023), N(0, 1) at each step within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
-    # the package scales it to a standard deviation of 1 as if there were no power at f = 0: scale it down by that
+    # the package's scale leaves out the power at f = 0: correct it
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))
     power = frequencies.clip(1 / shape[-1]) ** -beta
     return noise * np.sqrt(power[1:].sum() / power.sum())
@@ -280,7 +280,9 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
         meta = json.loads((path / "meta.json").read_text())
         if meta["format"] != FORMAT:
             fail(f"{path} has format {meta['format']}, this script writes {FORMAT}; start again with --overwrite")
-    arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy") if meta["episodes_done"]}
+    arrays = {}
+    if meta["episodes_done"]:
+        arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy")}
     if meta["episodes_done"] == args.num_episodes:
         return arrays
     envs, count = make_envs(args), args.num_episodes
@@ -308,8 +310,8 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
                 fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free; lower --num-episodes")
             path.mkdir(exist_ok=True)
             for name, x in buffer.items():
-                dtype, shape = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32), (count, *x.shape[1:])
-                arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, shape)
+                dtype = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32)
+                arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, (count, *x.shape[1:]))
         for name, x in buffer.items():
             arrays[name][first : first + envs.num_envs] = x[: count - first].cpu()
         meta["episodes_done"] = min(first + envs.num_envs, count)
@@ -368,10 +370,10 @@ def main(args: Args) -> None:
         list(arrays["rgb"].shape[2:]), arrays["joints"].shape[-1], args.u_dim, args.psi_images, args.amp
     )
     g = Predictor(args.u_dim, action_dim)
-    for mean, std, x in ((phi.mean, phi.std, train["state"]), (psi.joints_mean, psi.joints_std, train["joints"])):
-        mean.copy_(torch.from_numpy(x.mean((0, 1), dtype=np.float64)))
+    for name, mean, std in (("state", phi.mean, phi.std), ("joints", psi.joints_mean, psi.joints_std)):
+        mean.copy_(torch.from_numpy(train[name].mean((0, 1), dtype=np.float64)))
         # the floor keeps a centimetre of jitter from counting as much as the whole table
-        std.copy_(torch.from_numpy(x.std((0, 1), dtype=np.float64).clip(0.05)))
+        std.copy_(torch.from_numpy(train[name].std((0, 1), dtype=np.float64).clip(0.05)))
     frames = np.array(train["rgb"][:128, ::8], np.float32)  # a sample that fits into memory
     psi.image_mean = torch.from_numpy(frames.mean((0, 1)))
     psi.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
@@ -398,9 +400,8 @@ def main(args: Args) -> None:
             losses = repr_losses(model, transitions(index), args)
             optimizer.zero_grad()
             losses["total"].backward()
-            nn.utils.clip_grad_norm_(
-                model.parameters(), math.inf, error_if_nonfinite=True
-            )  # clips nothing, stops at NaN
+            # clips nothing, stops at NaN
+            nn.utils.clip_grad_norm_(model.parameters(), math.inf, error_if_nonfinite=True)
             optimizer.step()
             bar.update()
 
@@ -425,7 +426,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
-# the same in every script
+# the same in every script that simulates
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -450,7 +451,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         # note where they were; _view takes the picture and puts them back before the next physics step.
         if not self.task.gpu_sim_enabled:
             self.task.evaluate = evaluate_and_note_poses
-        self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))  # pictures belong to it now
+        self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))  # adds rgb
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
         rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"]
@@ -460,7 +461,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
                 actor.pose = pose
         seen = {"agent": obs_dict["agent"], "tcp_pose": obs_dict["extra"].pop("tcp_pose")}
         state = common.flatten_state_dict(obs_dict["extra"], use_torch=True).float()
-        state = torch.where(state.abs() > 500, 1.0, state)  # hidden: 1 m up, not 1 km, which would drown all else
+        state = torch.where(state.abs() > 500, 1.0, state)  # hidden objects have z = 1000: 1 in its place
         cue = self.task.oracle_info.float().reshape(len(state), -1)
         obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}
@@ -596,7 +597,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
-# the same in every script
+# what a script has of these is the same in all
 
 
 def fail(message: str) -> NoReturn:

@@ -349,7 +349,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023), N(0, 1) at each step within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
-    # the package scales it to a standard deviation of 1 as if there were no power at f = 0: scale it down by that
+    # the package's scale leaves out the power at f = 0: correct it
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))
     power = frequencies.clip(1 / shape[-1]) ** -beta
     return noise * np.sqrt(power[1:].sum() / power.sum())
@@ -399,7 +399,7 @@ def rollout(
             if t == steps:
                 break  # the last observation is only for its value
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            # each step's own, also of coloured noise; of the action before it is clamped
+            # of each step alone, although coloured noise is correlated; of the action before clamping
             step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
             if deterministic:
                 step["state"] = torch.as_tensor(info["state"], dtype=torch.float32, device=device)
@@ -546,9 +546,9 @@ def main(args: Args) -> None:
         scalars["charts/episodic_return"] = scalars["train/return"]
 
         values, rewards = buffer.pop("values"), buffer["rewards"]
-        if args.reward_norm:  # as gymnasium's NormalizeReward; compute_gae gives the discounted sums
+        if args.reward_norm:  # by the discounted sums of the rewards to come, which compute_gae gives
             sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
-            reward_var += (sums.var().item() - reward_var) / iteration  # mean of all iterations'
+            reward_var += (sums.var().item() - reward_var) / iteration  # mean over iterations
             rewards = rewards / (reward_var + 1e-8) ** 0.5
         buffer["advantages"] = compute_gae(rewards, values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
@@ -567,7 +567,7 @@ def main(args: Args) -> None:
                 applied.append({name: x.detach() for name, x in losses.items()})
             if stop:
                 break
-        for name in losses:  # of the minibatch that ended the update, if there was no step before it
+        for name in losses:  # without a step of the minibatch that ended the update
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
@@ -605,7 +605,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
-# the same in every script
+# the same in every script that simulates
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -630,7 +630,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         # note where they were; _view takes the picture and puts them back before the next physics step.
         if not self.task.gpu_sim_enabled:
             self.task.evaluate = evaluate_and_note_poses
-        self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))  # pictures belong to it now
+        self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))  # adds rgb
 
     def _view(self, obs_dict: dict, info: dict) -> tuple[dict, dict]:
         rgb = self.task._get_obs_sensor_data()["base_camera"]["rgb"]
@@ -640,7 +640,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
                 actor.pose = pose
         seen = {"agent": obs_dict["agent"], "tcp_pose": obs_dict["extra"].pop("tcp_pose")}
         state = common.flatten_state_dict(obs_dict["extra"], use_torch=True).float()
-        state = torch.where(state.abs() > 500, 1.0, state)  # hidden: 1 m up, not 1 km, which would drown all else
+        state = torch.where(state.abs() > 500, 1.0, state)  # hidden objects have z = 1000: 1 in its place
         cue = self.task.oracle_info.float().reshape(len(state), -1)
         obs = {"rgb": rgb, "joints": common.flatten_state_dict(seen, use_torch=True)}
         return obs, {"success": info["success"].float(), "state": state, "cue": cue}
@@ -776,7 +776,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
-# the same in every script
+# what a script has of these is the same in all
 
 
 def fail(message: str) -> NoReturn:
