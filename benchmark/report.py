@@ -306,8 +306,8 @@ def learning_curves(evals: list[dict], path: Path) -> None:
             draw(ax, curves, method, COLOURS[method])
             seeds.append(f"{method} {len(curves)}")
         ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
-        ax.set_title(f"{task.removesuffix('-v0')}, {setting}\nseeds: {', '.join(seeds)}", fontsize=10)
-        ax.set(xlabel="environment steps", ylim=(0, 1.02))
+        ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}")
+        ax.set(xlabel="PPO steps", ylim=(0, 1.02))
     axes[0].set_ylabel("success_once")
     save_figure(figure, axes, path)
 
