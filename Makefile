@@ -20,7 +20,7 @@ run: setup
 
 demo: setup
 	task="--env-id RememberColor3-v0 --small"
-	echo "AIB on RememberColor3-v0 in three stages, about 18 minutes on two cores; stopped, make demo resumes it"
+	echo "AIB on RememberColor3-v0 in three stages, about 20 minutes on two cores; stopped, make demo resumes it"
 	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 3 minutes"
 	$(PY) aib_repr.py $$task
 	echo "stage 2 of 3: the belief, about 1 minute"
