@@ -88,6 +88,8 @@ class Args:
     """episodes per iteration; on physx_cuda one arm pose is drawn for all of them"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
+    cnn_lr_scale: float = 1.0
+    """the policy's image network learns at this multiple of --learning-rate"""
     update_epochs: int = 2
     """passes over an iteration's data"""
     num_minibatches: int = 32
@@ -366,7 +368,9 @@ def main(args: Args) -> None:
     envs, device = make_envs(args), torch.device(args.device)
     torch.manual_seed(args.seed)
     agent = Agent(envs, args).to(device)
-    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
+    others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]
+    cnn = {"params": agent.cnn.parameters(), "lr": args.cnn_lr_scale * args.learning_rate}
+    optimizer = torch.optim.Adam([cnn, {"params": others}], lr=args.learning_rate, eps=1e-5, fused=True)
     completed, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     reward_var = checkpoint.get("reward_var", 0.0)
     if checkpoint:

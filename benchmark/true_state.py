@@ -80,7 +80,7 @@ class StateAgent(nn.Module):
     def __init__(self, envs: gym.vector.VectorEnv, args: ppo_baseline.Args, phi: StateEncoder | None = None):
         super().__init__()
         image_shape = envs.single_observation_space["rgb"].shape
-        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, args.amp)) if image_shape[0] > 1 else None
+        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, args.amp)) if image_shape[0] > 1 else nn.Sequential()
         (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
         self.phi = phi
         input_dim = 25 + phi(phi.mean).mean.numel() if phi else joints_dim
