@@ -168,9 +168,9 @@ def results_table(evals: list[dict]) -> str:
             row.append(f"{theirs['last']} ± {theirs['last_std']}" if theirs else "")
         for method in METHODS.values():
             row.append(summarise(last_three(by_seed(evals, "success_once", task=task, method=method, setting=setting))))
-        rows.append([*row, setting])
+        rows.append(row)
     head = ["task", "chance", *[f"{method}, paper" for method in METHODS.values()]]
-    head += [*[f"{method}, here" for method in METHODS.values()], "setting"]
+    head += [f"{method}, here" for method in METHODS.values()]
     return markdown(head, rows)
 
 
@@ -291,15 +291,13 @@ def save_figure(figure: plt.Figure, axes: np.ndarray, path: Path) -> None:
 
 
 def learning_curves(evals: list[dict], path: Path) -> None:
-    """success_once of the three methods in every row of README's table that has runs, with the chance level."""
-    panels = []
+    """success_once of the three methods on each task of README's table, in its first row that has runs, and chance."""
+    panels = {}
     for task, setting in rows_of("results"):
         if by_seed(evals, "success_once", task=task, setting=setting):
-            panels.append((task, setting))
-    figure, axes = plt.subplots(
-        1, len(panels), figsize=(4 * len(panels), 3.4), layout="constrained", sharex=True, sharey=True
-    )
-    for ax, (task, setting) in zip(axes, panels, strict=True):
+            panels.setdefault(task, setting)
+    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 3.4), layout="constrained", sharey=True)
+    for ax, (task, setting) in zip(axes, panels.items(), strict=True):
         seeds = []
         for method in METHODS.values():
             curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
