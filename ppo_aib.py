@@ -571,7 +571,7 @@ def main(args: Args) -> None:
                 applied.append({name: x.detach() for name, x in losses.items()})
             if stop:
                 break
-        for name in losses:  # without a step of the minibatch that ended the update
+        for name in losses:  # if there was no step: of the minibatch that ended the update
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
