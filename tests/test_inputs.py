@@ -103,6 +103,7 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_believer", ["--eval-every", "0"], ["--eval-every 0"]),
         ("ppo_baseline", ["--seed", "-1"], ["--seed -1"]),
         ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
+        ("ppo_baseline", ["--final-std", "0"], ["--final-std 0.0", "at least 0.001"]),
         ("ppo_baseline", ["--noise-beta", "-0.1"], ["--noise-beta -0.1", "between 0 and 2"]),
         ("ppo_baseline", ["--num-eval-episodes", "1"], ["--num-eval-episodes 1 must be at least 2"]),
         ("ppo_aib", ["--noise-beta", "2.5"], ["--noise-beta 2.5", "between 0 and 2"]),

@@ -403,6 +403,23 @@ def test_evaluate_takes_over_what_the_episodes_depend_on(toy_task: Path, monkeyp
     assert seeds == [ppo_baseline.EVAL_SEED + 2**20 + i for i in range(4)], "no episode of any training's evaluations"
 
 
+@pytest.mark.parametrize("script", METHODS)
+def test_the_standard_deviation_falls_linearly_to_final_std(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    module, stds = SCRIPTS[script], []
+    losses = module.ppo_losses
+
+    def watched_losses(agent: torch.nn.Module, *others: object) -> dict:
+        stds.append(agent.log_std.exp().mean().item())
+        return losses(agent, *others)
+
+    monkeypatch.setattr(module, "ppo_losses", watched_losses)
+    path = train(module, **small(module, toy_stages, target_kl=1e9, init_std=0.5, final_std=0.1))
+    assert stds == pytest.approx([0.3] * 8 + [0.1] * 8), "two iterations of 8 minibatches"
+    assert torch.allclose(torch.load(path / "agent.pt", weights_only=True)["agent"]["log_std"].exp(), torch.tensor(0.1))
+
+
 def test_orthogonal_initialisation() -> None:
     agent = ppo_baseline.Agent(toy.ToyMemory(1), ppo_baseline.Args())
     for layer, gain in ((agent.joints[0], 2**0.5), (agent.actor[2], 0.01 * 2**0.5), (agent.critic[2], 2**0.5)):

@@ -16,9 +16,9 @@ OWN = ("Args", "main", "evaluate_checkpoint", "SMALL", "QUICK", "LIMITS", "MAY_D
 BUDGET = {  # a reader's: tokens of code, lines, tokens a code line
     "aib_repr": (6024, 695, 12.5),
     "aib_belief": (5965, 684, 13.1),
-    "ppo_aib": (7631, 903, 12.0),
-    "ppo_believer": (9627, 1095, 12.5),
-    "ppo_baseline": (6048, 722, 11.8),
+    "ppo_aib": (7701, 909, 12.0),
+    "ppo_believer": (9697, 1101, 12.5),
+    "ppo_baseline": (6118, 728, 11.8),
 }
 
 
@@ -84,7 +84,7 @@ def test_the_method_comes_first_and_the_loop_is_in_main(script: str) -> None:
     assert ends[method] < len(lines) / 2
     (main,) = (node for node in TREES[script].body if isinstance(node, ast.FunctionDef) and node.name == "main")
     called = {node.func.attr for node in ast.walk(main) if isinstance(node, ast.Call) and hasattr(node.func, "attr")}
-    assert {"backward", "step", "zero_grad"} <= called and main.end_lineno - main.lineno <= 106
+    assert {"backward", "step", "zero_grad"} <= called and main.end_lineno - main.lineno <= 109
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
