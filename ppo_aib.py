@@ -158,10 +158,10 @@ TASKS = {  # Table 5; all other tasks get the defaults above, which are Intercep
 }
 SMALL = dict(exp_name="ppo_aib_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, reward_norm=True, joints_norm=True)
-SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64)
-SMALL |= dict(amp=BFLOAT16, num_episodes=640, belief="runs/{env_id}__aib_belief_small__{seed}/belief.pt")
-QUICK = dict(exp_name="ppo_aib_quick", num_episodes=8, total_timesteps=360, num_envs=2, num_eval_episodes=2)
-QUICK |= dict(num_minibatches=4, belief="runs/{env_id}__aib_belief_quick__{seed}/belief.pt")
+SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
+SMALL |= dict(num_episodes=640, belief="runs/{env_id}__aib_belief_small__{seed}/belief.pt")
+QUICK = dict(exp_name="ppo_aib_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
+QUICK |= dict(num_episodes=8, belief="runs/{env_id}__aib_belief_quick__{seed}/belief.pt")
 
 
 # ---------------------------------------------------------------- networks
@@ -489,8 +489,7 @@ def evaluate_checkpoint(args: Args) -> None:
     """Evaluate the agent of --checkpoint, on test episodes; writes evaluation.json and .mp4 beside it."""
     file = Path(args.checkpoint.format(**vars(args)))
     stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
-    task = ("env_id", "robot_triangles", "image_size", "num_envs")
-    for name in (*task, "amp", "num_particles", "sample_decoder"):
+    for name in ("env_id", "robot_triangles", "image_size", "num_envs", "amp", "num_particles", "sample_decoder"):
         setattr(args, name, stored[name])
     check_task(args)
     envs, device = make_envs(args), torch.device(args.device)
