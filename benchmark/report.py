@@ -41,7 +41,7 @@ CHANCE = {  # one of so many objects is the right one
     "RememberShapeAndColor3x2-v0": 1 / 6,
 }
 HEAD_SETTING = "128 px, 2000 episodes, 700 updates"
-ORACLE_STEPS = (28800, 57600, 86400, 115200, 144000, 240000)
+ORACLE_STEPS = (28800, 57600, 86400, 115200, 144000, 240000, 480000)
 
 
 @dataclass
