@@ -3,13 +3,12 @@
 # make test: set everything up, then lint and run the tests
 # make test-all: all tests, with every kill of every stage and three seeds of the learning test
 # make test-gpu: the three PPO scripts' --quick on a GPU, with physics there and then on the CPU
-# make bench: speed and memory, as ratios measured in one run
-# make bench-belief: train the belief, one without action head and Believer's on RememberColor3; what each remembers
+# make bench: speed, as ratios measured in one run
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .ONESHELL:
 .SILENT:
-.PHONY: run demo test test-all test-gpu bench bench-belief setup vulkan
+.PHONY: run demo test test-all test-gpu bench setup vulkan
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -51,9 +50,6 @@ test-gpu: setup
 
 bench: setup
 	$(PY) benchmark/speed.py
-
-bench-belief: setup
-	$(PY) benchmark/belief.py
 
 setup: .venv/installed vulkan
 
