@@ -5,8 +5,8 @@ tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) sh
 that shape to the prior, which is what the robot has when it acts.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
-Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt, or --repr-dir; if the former are missing,
-         aib_repr.py runs first
+Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt, or --repr-dir; where
+         the former has no repr.pt, aib_repr.py runs first
 Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, TensorBoard events; args.json and
          checkpoint.pt to resume
 """
@@ -68,7 +68,7 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
     small: bool = False
     """a reduced setting for a CPU and half an hour; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
@@ -79,7 +79,7 @@ class Args:
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """random episodes that the belief is trained on; stage 1 collects them if they are missing"""
+    """random episodes of stage 1, which collects them if they are missing; a tenth is held out"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 3) are taken to be updates"""
     batch_episodes: int = 256
@@ -97,7 +97,7 @@ class Args:
     action_lambda: float = 1.0
     """weight of the action head's loss"""
     fm_latent: Literal["mean", "sample"] = "mean"
-    """z that the action head gets: q's means, or samples, the paper's, which are mostly noise early in training"""
+    """z that the action head gets: q's means, or samples of q, as in the paper, which are mostly noise at first"""
     bptt_steps: int | None = None
     """cut back-propagation through time after this many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
@@ -410,13 +410,13 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
     nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: low also where the
     samples lie at several possible places, one of them u's; nll_posterior (E, T+1): -log p(u|z,h) with z ~ q(z|u,h)
     """
-    torch.manual_seed(0)  # the same noise at every validation
+    torch.manual_seed(0)  # the same noise every time, so that errors compare
+    num_particles = 30
     parts = []
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
         u, h = batch["u"], encode_history(belief.history, batch)
         nll, _, _, mean = elbo_terms(belief, posterior, u, h)
-        num_particles = 30
         decoded = belief.decode(h, torch.randn(*h.shape[:-1], num_particles, mean.shape[-1], device=h.device))
         log_p = decoded.log_prob(u.unsqueeze(-2)).sum(-1)
         part = {"h": h, "u": u, "actions": batch["actions"], "z_mean": mean}
@@ -457,7 +457,7 @@ def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
 
 @torch.no_grad()
 def flow_gain(head: nn.Module, z: Tensor, action: Tensor) -> tuple[float, float]:
-    """L_FM, and how much larger it is with the z of other episodes; z (E, T+1, z_dim), action (E, T, A).
+    """L_FM of q's means z (E, T+1, z_dim), and how much larger it is with those of other episodes; action (E, T, A).
 
     With a gain near 0 the action head reads nothing from z, and so shapes nothing.
     """

@@ -73,7 +73,7 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
     small: bool = False
     """a reduced setting for a CPU and half an hour; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
@@ -275,11 +275,9 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     rgb (N, T+1, H, W, 3) uint8; joints, state (N, T+1, .); actions (N, T, A); rewards, success (N, T); cue, the memory
     variable (N, K).
     """
-    meta = {"format": FORMAT, **asdict(args), "camera": "base_camera", "episodes_done": 0}
+    meta = {"format": FORMAT, **asdict(args), "episodes_done": 0}
     if (path / "meta.json").exists():
         meta = json.loads((path / "meta.json").read_text())
-        if meta["format"] != FORMAT:
-            fail(f"{path} has format {meta['format']}, this script writes {FORMAT}; start again with --overwrite")
     arrays = {}
     if meta["episodes_done"]:
         arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy")}
@@ -352,12 +350,22 @@ def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
     num_val = round(args.num_episodes * args.val_fraction)
     if not 4 <= num_val < args.num_episodes:  # stage 2 fits read-outs on half of them and tests them on the other
-        fail(f"--val-fraction {args.val_fraction} of --num-episodes {args.num_episodes} must be 4 or more, and not all")
+        fail(
+            f"--val-fraction {args.val_fraction} must hold out 4 of --num-episodes {args.num_episodes} or more, not all"
+        )
     path, device = check_run(args), torch.device(args.device)
     if (path / "repr.pt").exists() and not args.overwrite:
         print(f"{path / 'repr.pt'} is finished; --overwrite recreates it")
         return
     check_task(args)
+    meta = path / "dataset" / "meta.json"
+    if meta.exists() and not args.overwrite:
+        found, needed = json.loads(meta.read_text()), {"format": FORMAT, **asdict(args)}
+        for name in ("format", "env_id", "robot_triangles", "image_size", "num_episodes"):
+            if found.get(name) != needed[name]:
+                fail(
+                    f"{meta.parent} has {name} {found.get(name)}, this run needs {needed[name]}; --overwrite deletes it"
+                )
     open_run(path, args)
     arrays = collect_random_episodes(args, path / "dataset")
     transitions = TransitionDataset(path / "dataset", args.psi_images, device)
@@ -563,9 +571,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Build environments whose episodes all last max_episode_steps, without auto-reset.
 
     Actions lie in [-1, 1]: changes of the arm's 7 joint angles, and the gripper's opening.
-    physx_cuda: one batch of args.num_envs scenes, all drawn by the first of reset's seeds. physx_cpu: up to
-    args.num_workers processes of one scene each, all forked from one that has imported the tasks, or spawned beside
-    CUDA, which does not survive a fork.
+    physx_cuda: one batch of args.num_envs scenes; torch's draws and the arm's pose follow the first of reset's seeds.
+    physx_cpu: up to args.num_workers processes of one scene each, all forked from one that has imported the tasks, or
+    spawned beside CUDA, which does not survive a fork.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)

@@ -47,7 +47,7 @@ from tqdm import tqdm
 FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
-EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; training has those below 2**30, stage 1 those between
+EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; PPO trains on those below 2**30, stage 1 has those between
 TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, never used for training or tuning
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
@@ -74,7 +74,7 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
     small: bool = False
     """a reduced setting for a CPU and half an hour; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
@@ -261,7 +261,8 @@ def rollout(
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
     Returns tensors (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; and values (T+1, N), V(o_T)
-    last. Episodes are played in rounds of envs.num_envs; all noise is drawn before, so that their size does not matter.
+    last. Episodes are played in rounds of envs.num_envs; all noise is drawn before, so that on physx_cpu the size of a
+    round does not matter.
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
@@ -315,7 +316,7 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
     rgb = buffer["rgb"][:, :4].cpu().numpy()
-    scale = math.ceil(256 / rgb.shape[2])
+    scale = 2 * math.ceil(128 / rgb.shape[2])  # even, as mp4 needs its sizes
     rgb = rgb.repeat(scale, axis=2).repeat(scale, axis=3)
     succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
     rgb[1:, :, :8][succeeded] = (0, 255, 0)
@@ -345,9 +346,11 @@ def evaluate_checkpoint(args: Args) -> None:
     agent = Agent(envs, args).to(device)
     agent.load_state_dict(stored["agent"])
     metrics, video = evaluate(envs, agent, args, TEST_SEED)
-    save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
+    metrics |= {"global_step": stored["global_step"], "num_eval_episodes": args.num_eval_episodes}
+    report = json.dumps(metrics, indent=2)
+    save(file.with_name("evaluation.json"), report.encode())
     save(file.with_name("evaluation.mp4"), video)
-    print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
+    print(f"{file} on test episodes: {report}")
     envs.close()
 
 
@@ -592,9 +595,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Build environments whose episodes all last max_episode_steps, without auto-reset.
 
     Actions lie in [-1, 1]: changes of the arm's 7 joint angles, and the gripper's opening.
-    physx_cuda: one batch of args.num_envs scenes, all drawn by the first of reset's seeds. physx_cpu: up to
-    args.num_workers processes of one scene each, all forked from one that has imported the tasks, or spawned beside
-    CUDA, which does not survive a fork.
+    physx_cuda: one batch of args.num_envs scenes; torch's draws and the arm's pose follow the first of reset's seeds.
+    physx_cpu: up to args.num_workers processes of one scene each, all forked from one that has imported the tasks, or
+    spawned beside CUDA, which does not survive a fork.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)

@@ -5,8 +5,8 @@ action head. Networks, settings, PPO, evaluation and tags are those of aib_belie
 
 Usage:   python ppo_believer.py --env-id InterceptFast-v0
          python ppo_believer.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_believer__1/agent.pt
-Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt, or --repr-dir; if the former are missing,
-         aib_repr.py runs first
+Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt, or --repr-dir; where
+         the former has no repr.pt, aib_repr.py runs first
 Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, agent.pt, eval.csv, videos/, TensorBoard events; args.json and
          checkpoint.pt to resume; with --evaluate evaluation.json and .mp4 beside agent.pt
 """
@@ -59,7 +59,7 @@ FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CNN_CHUNK = 2048  # images through a belief's CNN at a time; their activations take 1 to 2 GB
 CUDA = torch.cuda.is_available()
 BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
-EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; training has those below 2**30, stage 1 those between
+EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; PPO trains on those below 2**30, stage 1 has those between
 TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, never used for training or tuning
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
@@ -86,7 +86,7 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes results by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
     small: bool = False
     """a reduced setting for a CPU and half an hour; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
@@ -97,7 +97,7 @@ class Args:
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """random episodes that the belief is trained on; stage 1 collects them if they are missing"""
+    """random episodes of stage 1, which collects them if they are missing; a tenth is held out"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 2) are taken to be updates"""
     batch_episodes: int = 256
@@ -493,7 +493,7 @@ def rollout(
     Returns tensors (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; and values (T+1, N),
     V(o_T) last; if deterministic also the privileged state, which the evaluation compares the belief with.
     The particles are kept because fresh ones would change the probability ratio of the update. Episodes are played in
-    rounds of envs.num_envs scenes, fewer than args.num_envs on physx_cpu; all noise is drawn before the first round, so
+    rounds of envs.num_envs scenes, at most args.num_envs on physx_cpu; all noise is drawn before the first round, so
     that the size of a round changes results by rounding only. info: see PrivilegedInfoWrapper.
     """
     num_episodes = len(seeds)
@@ -552,11 +552,13 @@ def rollout(
 def validate_belief(belief: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> tuple[Tensor, Tensor]:
     """u and mean particle, both (T+1, E, u_dim), of episodes index (E,) that the belief is not trained on."""
     torch.manual_seed(0)  # the same noise every time, so that errors compare
+    num_particles = 30
     u, estimate = [], []
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
         h = encode_history(belief.history, batch)
-        decoded = belief.decode(h, torch.randn(*h.shape[:-1], 30, belief.config["z_dim"], device=h.device))
+        z_noise = torch.randn(*h.shape[:-1], num_particles, belief.config["z_dim"], device=h.device)
+        decoded = belief.decode(h, z_noise)
         u.append(batch["u"])
         estimate.append(decoded.mean.mean(-2))
     return torch.cat(u, 1), torch.cat(estimate, 1)
@@ -574,7 +576,7 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
     rgb = buffer["rgb"][:, :4].cpu().numpy()
-    scale = math.ceil(256 / rgb.shape[2])
+    scale = 2 * math.ceil(128 / rgb.shape[2])  # even, as mp4 needs its sizes
     rgb = rgb.repeat(scale, axis=2).repeat(scale, axis=3)
     succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
     rgb[1:, :, :8][succeeded] = (0, 255, 0)
@@ -611,7 +613,8 @@ def evaluate(
 def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict) -> None:
     """Train Believer's belief on stage 1's output as aib_belief.py does; writes belief.pt into path."""
     device = torch.device(args.device)
-    train, held_out = np.split(np.arange(args.num_episodes), [-stored["num_val"]])
+    inds, num_val = np.arange(args.num_episodes), stored["num_val"]
+    train, test_on = inds[:-num_val], inds[-(num_val // 2) :]  # aib_belief.py fits its probes on those between
     sample = episodes(train[:1])
     config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
     config["joints_dim"] = sample["joints"].shape[-1] if args.history_joints else 0
@@ -660,7 +663,7 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
                 writer.add_scalar(f"belief/{name}", value, update)
 
         if update % args.val_every == 0 or update == args.num_updates:
-            u, estimate = validate_belief(model["belief"], episodes, held_out)
+            u, estimate = validate_belief(model["belief"], episodes, test_on)
             error = (u - estimate).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
             bar.set_postfix(held_out_error=f"{error:.3f}")
@@ -672,7 +675,7 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
     writer.close()
     content = {"kind": "believer_belief", "config": config, "belief": model["belief"].state_dict()}
     save(path / "belief.pt", content)
-    u, estimate = validate_belief(model["belief"], episodes, held_out)
+    u, estimate = validate_belief(model["belief"], episodes, test_on)
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {r_squared(u[-1], estimate[-1]):.2f}")
 
 
@@ -687,9 +690,11 @@ def evaluate_checkpoint(args: Args) -> None:
     agent = Agent(envs, BelieverBelief(stored["config"], args.amp), args).to(device)
     agent.load_state_dict(stored["agent"])
     metrics, video = evaluate(envs, agent, args, TEST_SEED)
-    save(file.with_name("evaluation.json"), json.dumps(metrics, indent=2).encode())
+    metrics |= {"global_step": stored["global_step"], "num_eval_episodes": args.num_eval_episodes}
+    report = json.dumps(metrics, indent=2)
+    save(file.with_name("evaluation.json"), report.encode())
     save(file.with_name("evaluation.mp4"), video)
-    print(f"{file}, {args.num_eval_episodes} episodes: " + ", ".join(f"{k} {v:.3f}" for k, v in metrics.items()))
+    print(f"{file} on test episodes: {report}")
     envs.close()
 
 
@@ -943,9 +948,9 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Build environments whose episodes all last max_episode_steps, without auto-reset.
 
     Actions lie in [-1, 1]: changes of the arm's 7 joint angles, and the gripper's opening.
-    physx_cuda: one batch of args.num_envs scenes, all drawn by the first of reset's seeds. physx_cpu: up to
-    args.num_workers processes of one scene each, all forked from one that has imported the tasks, or spawned beside
-    CUDA, which does not survive a fork.
+    physx_cuda: one batch of args.num_envs scenes; torch's draws and the arm's pose follow the first of reset's seeds.
+    physx_cpu: up to args.num_workers processes of one scene each, all forked from one that has imported the tasks, or
+    spawned beside CUDA, which does not survive a fork.
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)

@@ -91,7 +91,8 @@ def eval_rows(folder: Path, setting: str) -> tuple[list[dict], list[dict]]:
             rows.append({**run, "step": row["global_step"], **rounded(row)})
         test = file.with_name("evaluation.json")
         if test.exists():
-            test_rows.append({**run, "step": rows[-1]["step"], **rounded(json.loads(test.read_text()))})
+            found = json.loads(test.read_text())
+            test_rows.append({**run, "step": found["global_step"], **rounded(found)})
     return rows, test_rows
 
 

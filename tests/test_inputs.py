@@ -166,11 +166,15 @@ def change(path: Path, **values: object) -> Callable[[], object]:
     return lambda: torch.save({**torch.load(path, weights_only=True), **values}, path)
 
 
-def other_dataset() -> None:
-    """A dataset of another format, on which stage 1 has still to be trained."""
-    REPR_PT.unlink()
-    meta = json.loads((DATA / "meta.json").read_text())
-    (DATA / "meta.json").write_text(json.dumps({**meta, "format": 9}))
+def other_dataset(**values: object) -> Callable[[], object]:
+    """A dataset with other entries in its meta.json, on which stage 1 has still to be trained."""
+
+    def damage() -> None:
+        REPR_PT.unlink()
+        meta = json.loads((DATA / "meta.json").read_text())
+        (DATA / "meta.json").write_text(json.dumps({**meta, **values}))
+
+    return damage
 
 
 STAGE_1 = dict(num_episodes=20, val_fraction=0.25, epochs=1, batch_size=50)
@@ -181,7 +185,8 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
     "nothing held out": (aib_repr, dict(val_fraction=0.0), None, ["--val-fraction 0.0", "--num-episodes"]),
     "all held out": (aib_repr, dict(val_fraction=1.0), None, ["--val-fraction 1.0"]),
     "no disk for it": (aib_repr, dict(exp_name="big", num_episodes=10**10), None, ["has free", "--num-episodes"]),
-    "dataset of another format": (aib_repr, STAGE_1, other_dataset, ["has format 9", "--overwrite"]),
+    "dataset of another format": (aib_repr, STAGE_1, other_dataset(format=9), ["has format 9", "--overwrite"]),
+    "dataset of more episodes": (aib_repr, STAGE_1, other_dataset(num_episodes=30), ["has num_episodes 30"]),
     "repr.pt cut short": (aib_belief, STAGE_2, cut(REPR_PT), ["repr.pt is damaged", "--overwrite"]),
     "repr.pt of another task": (aib_belief, STAGE_2, change(REPR_PT, env_id="X-v0"), ["has env_id X-v0"]),
     "repr.pt of fewer episodes": (

@@ -420,6 +420,12 @@ def test_the_standard_deviation_falls_linearly_to_final_std(
     assert torch.allclose(torch.load(path / "agent.pt", weights_only=True)["agent"]["log_std"].exp(), torch.tensor(0.1))
 
 
+@pytest.mark.parametrize("size", [37, 91, 257])
+def test_pictures_of_any_size_make_a_video(size: int) -> None:
+    buffer = {"rgb": torch.zeros(3, 2, size, size, 3, dtype=torch.uint8), "success": torch.zeros(3, 2)}
+    assert len(ppo_baseline.make_video(buffer)) > 1000
+
+
 def test_orthogonal_initialisation() -> None:
     agent = ppo_baseline.Agent(toy.ToyMemory(1), ppo_baseline.Args())
     for layer, gain in ((agent.joints[0], 2**0.5), (agent.actor[2], 0.01 * 2**0.5), (agent.critic[2], 2**0.5)):

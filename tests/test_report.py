@@ -68,7 +68,9 @@ def test_five_seeds_have_a_bootstrap_interval() -> None:
 
 def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     record(tmp_path, "ppo_aib_small", 3, [0.25, 0.5])
-    (tmp_path / f"{TASK}__ppo_aib_small__3" / "evaluation.json").write_text('{"success_once": 0.75, "u_r2": 0.5}')
+    (tmp_path / f"{TASK}__ppo_aib_small__3" / "evaluation.json").write_text(
+        '{"global_step": 960, "success_once": 0.75}'
+    )
     monkeypatch.setattr(report, "RESULTS", tmp_path)
     for name in ("eval.csv", "test.csv"):
         (tmp_path / name).write_text(",".join(report.KEY + report.METRICS) + "\n")
@@ -90,7 +92,7 @@ def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.Monke
         "u_r2_at_end": "",
     }
     (test,) = report.read("test.csv")
-    assert (test["setting"], test["step"], test["success_once"]) == ("pink noise", "2000", "0.7500")
+    assert (test["setting"], test["step"], test["success_once"]) == ("pink noise", "960", "0.7500")
 
 
 def test_pages_and_figures_are_those_of_the_data(tmp_path: Path) -> None:
