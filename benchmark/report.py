@@ -41,6 +41,7 @@ CHANCE = {  # one of so many objects is the right one
     "RememberShapeAndColor3x2-v0": 1 / 6,
 }
 HEAD_SETTING = "128 px, 2000 episodes, 700 updates"
+WHITE_SETTING = "raw rewards, raw joints, 128 px, white noise"  # without what lets --small learn in few steps
 ORACLE_STEPS = (28800, 57600, 86400, 115200, 144000, 240000, 480000)
 
 
@@ -304,6 +305,11 @@ def learning_curves(evals: list[dict], path: Path) -> None:
             curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
             draw(ax, curves, method, COLOURS[method])
             seeds.append(f"{method} {len(curves)}")
+        if setting == "small":
+            ((steps, values),) = by_seed(evals, "success_once", task=task, method="AIB", setting=WHITE_SETTING).values()
+            shown = steps <= 120_000
+            label = "AIB, white noise, raw rewards and joints (1 seed)"
+            ax.plot(steps[shown], values[shown], color=COLOURS["AIB"], linestyle="--", label=label)
         ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
         ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}")
         ax.set(xlabel="PPO steps", ylim=(0, 1.02))
