@@ -117,7 +117,7 @@ class Args:
 
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_size=(36, math.inf))
+LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
 LIMITS |= dict(image_shift=(0, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "sim_backend", "render_backend")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
@@ -603,10 +603,10 @@ def check_run(args: Args) -> Path:
     """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     if (path / "args.json").exists() and not args.overwrite:
-        recorded, changed = json.loads((path / "args.json").read_text()), []
-        for name, value in asdict(args).items():
-            if name not in MAY_DIFFER and recorded.get(name) != value:
-                changed.append(f"{name}={recorded.get(name)} there, {value} here")
+        recorded, given, changed = json.loads((path / "args.json").read_text()), asdict(args), []
+        for name in recorded | given:  # another script's run has others
+            if name not in MAY_DIFFER and recorded.get(name) != given.get(name):
+                changed.append(f"{name}={recorded.get(name)} there, {given.get(name)} here")
         if changed:
             fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
     return path
@@ -617,16 +617,17 @@ def open_run(path: Path, args: Args) -> None:
 
     With --overwrite what it holds is deleted. Fails when another process works there.
     """
+    recorded = path / "args.json"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
+        if args.overwrite:
+            save(recorded, b"{}")  # no run has these: what a kill leaves half deleted is not resumed
+            for file in set(path.iterdir()) - {recorded}:
+                shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
+        save(recorded, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
-    if args.overwrite:
-        # args.json goes last: a kill in between must not let other arguments resume what is left
-        for file in sorted(path.iterdir(), key=lambda file: file.name == "args.json"):
-            shutil.rmtree(file) if file.is_dir() else file.unlink()
-    save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 
 
 def save(path: Path, content: dict | bytes) -> None:

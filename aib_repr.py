@@ -116,7 +116,7 @@ class Args:
 
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, math.inf), robot_triangles=(0, math.inf), image_size=(36, math.inf))
+LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
 LIMITS |= dict(val_fraction=(0, 1), noise_beta=(0, 2))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
@@ -303,9 +303,6 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
         buffer = {name: torch.stack(xs, 1) for name, xs in buffer.items()}
         buffer |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue).reshape(len(rows), -1)}
         if not arrays:
-            size = buffer["rgb"][0].nbytes * count
-            if size > shutil.disk_usage(path.parent).free:
-                fail(f"{path} needs {size / 1e9:.1f} GB, more than its disk has free; lower --num-episodes")
             path.mkdir(exist_ok=True)
             for name, x in buffer.items():
                 dtype = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32)
@@ -363,9 +360,11 @@ def main(args: Args) -> None:
         found, needed = json.loads(meta.read_text()), {"format": FORMAT, **asdict(args)}
         for name in ("format", "env_id", "robot_triangles", "image_size", "num_episodes"):
             if found.get(name) != needed[name]:
-                fail(
-                    f"{meta.parent} has {name} {found.get(name)}, this run needs {needed[name]}; --overwrite deletes it"
-                )
+                fail(f"{path} has {name} {found.get(name)}, this run needs {needed[name]}; --overwrite deletes it")
+    else:
+        size = args.num_episodes * gym.spec(args.env_id).max_episode_steps * args.image_size**2 * 3
+        if size > shutil.disk_usage("runs" if Path("runs").exists() else ".").free:
+            fail(f"the pictures take {size / 1e9:.1f} GB, more than the disk has free; lower --num-episodes")
     open_run(path, args)
     arrays = collect_random_episodes(args, path / "dataset")
     transitions = TransitionDataset(path / "dataset", args.psi_images, device)
@@ -643,10 +642,10 @@ def check_run(args: Args) -> Path:
     """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     if (path / "args.json").exists() and not args.overwrite:
-        recorded, changed = json.loads((path / "args.json").read_text()), []
-        for name, value in asdict(args).items():
-            if name not in MAY_DIFFER and recorded.get(name) != value:
-                changed.append(f"{name}={recorded.get(name)} there, {value} here")
+        recorded, given, changed = json.loads((path / "args.json").read_text()), asdict(args), []
+        for name in recorded | given:  # another script's run has others
+            if name not in MAY_DIFFER and recorded.get(name) != given.get(name):
+                changed.append(f"{name}={recorded.get(name)} there, {given.get(name)} here")
         if changed:
             fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
     return path
@@ -657,16 +656,17 @@ def open_run(path: Path, args: Args) -> None:
 
     With --overwrite what it holds is deleted. Fails when another process works there.
     """
+    recorded = path / "args.json"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
+        if args.overwrite:
+            save(recorded, b"{}")  # no run has these: what a kill leaves half deleted is not resumed
+            for file in set(path.iterdir()) - {recorded}:
+                shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
+        save(recorded, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
-    if args.overwrite:
-        # args.json goes last: a kill in between must not let other arguments resume what is left
-        for file in sorted(path.iterdir(), key=lambda file: file.name == "args.json"):
-            shutil.rmtree(file) if file.is_dir() else file.unlink()
-    save(path / "args.json", json.dumps(asdict(args), indent=2).encode())
 
 
 def save(path: Path, content: dict | bytes) -> None:

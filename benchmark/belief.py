@@ -31,7 +31,7 @@ def main(args: ppo_believer.Args) -> None:
     if not (path / "belief.pt").exists():
         ppo_believer.train_belief(args, path, episodes, stored)
     belief = ppo_believer.BelieverBelief(ppo_believer.load(path / "belief.pt", "")["config"])
-    belief.prior = lambda h: Normal(torch.zeros(*h.shape[:-1], args.z_dim), 1.0)
+    belief.prior = lambda h: Normal(h.new_zeros(*h.shape[:-1], args.z_dim), 1.0)
     posterior = ppo_believer.GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     model = torch.nn.ModuleDict({"belief": belief, "posterior": posterior})
     model.load_state_dict(ppo_believer.load(path / "belief_checkpoint.pt", "")["model"])

@@ -110,7 +110,7 @@ def main(args: Args) -> None:
     if path.exists():
         fail(f"{path} exists; choose another --exp-name")
     hint = "name a run of aib_repr.py with --repr-dir"
-    stored = ppo_baseline.load(source / "repr.pt", hint, kind="repr", env_id=args.env_id)
+    stored = ppo_baseline.load(source / "repr.pt", hint, kind="repr", env_id=args.env_id, seed=args.seed)
     if stored["sim_backend"] != "physx_cpu":
         fail(f"{source} is of physx_cuda, which draws scenes by batch; only those of physx_cpu can be played again")
     task = {name: stored[name] for name in ("env_id", "robot_triangles", "image_size")}

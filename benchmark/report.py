@@ -271,9 +271,8 @@ def draw(axes: plt.Axes, curves: dict[str, tuple[np.ndarray, np.ndarray]], label
     """Mean over seeds at the steps all of them have, shaded by the standard deviation."""
     if not curves:
         return
-    length = min(len(steps) for steps, _ in curves.values())
-    steps = next(iter(curves.values()))[0][:length]
-    values = np.stack([values[:length] for _, values in curves.values()])
+    steps = sorted(set.intersection(*(set(steps) for steps, _ in curves.values())))
+    values = np.stack([values[np.isin(seed_steps, steps)] for seed_steps, values in curves.values()])
     (line,) = axes.plot(steps, values.mean(0), color=colour, label=label)
     if len(curves) > 1:
         spread = values.std(0, ddof=1)

@@ -131,4 +131,7 @@ if __name__ == "__main__":
     if args.pictures:
         name += "_pictures"
     args.exp_name, args.sim_backend = args.exp_name.replace("ppo_baseline", name), "physx_cpu"
-    ppo_baseline.main(args)
+    if args.evaluate:
+        ppo_baseline.evaluate_checkpoint(args)
+    else:
+        ppo_baseline.main(args)

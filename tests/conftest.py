@@ -23,6 +23,7 @@ import toy
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {module.__name__: module for module in (aib_repr, aib_belief, ppo_aib, ppo_believer, ppo_baseline)}
 TASK, TOY = "RememberColor9-v0", "ToyMemory-v0"
+ONE_ITERATION = ["--total-timesteps", "120"]  # of PPO with --quick
 os.environ["TQDM_MININTERVAL"] = "30"
 if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each process
     torch.set_num_threads(1)
@@ -43,7 +44,7 @@ def quick_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The runs folder of --quick runs of all three methods on a real task, made from nothing."""
     folder = tmp_path_factory.mktemp("quick")
     for script in ("ppo_aib", "ppo_believer", "ppo_baseline"):
-        code, out, err = run(script, "--env-id", TASK, "--quick", cwd=folder)
+        code, out, err = run(script, "--env-id", TASK, "--quick", *ONE_ITERATION, cwd=folder)
         assert code == 0, out + err
     return folder / "runs"
 

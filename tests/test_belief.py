@@ -1,11 +1,12 @@
 """Stage 2 as a whole: what it costs, and that it is the same computation as the slow way."""
 
+import json
 import os
 import subprocess
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,20 +16,7 @@ import aib_belief
 import aib_repr
 import ppo_aib
 import ppo_believer
-from conftest import ROOT, TOY, train
-from per_step_loop import encode_history_per_step
-
-
-def test_whole_sequences_give_what_a_per_step_loop_gives() -> None:
-    torch.manual_seed(0)
-    config = {"image_shape": [36, 36, 3], "joints_dim": 0, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
-    history = aib_belief.HistoryEncoder(config)
-    batch = {"rgb": torch.randint(0, 256, (8, 3, 36, 36, 3), dtype=torch.uint8), "joints": torch.zeros(8, 3, 7)}
-    h = aib_belief.encode_history(history, batch)
-    assert torch.allclose(h, encode_history_per_step(history, batch), atol=1e-5)
-    history.cnn.amp = True
-    low = aib_belief.encode_history(history, batch)
-    assert low.dtype == torch.float32 and torch.allclose(low, h, atol=0.05), "bfloat16 only roughly"
+from conftest import ROOT, SCRIPTS, TOY, train
 
 
 def make_stage_1(folder: Path, episodes: int) -> int:
@@ -71,6 +59,7 @@ def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks, encoded, encode = [], [], aib_belief.encode
+    read = note_episodes(monkeypatch, aib_belief)
 
     def recorded(belief: torch.nn.Module, *arguments: object) -> dict[str, torch.Tensor]:
         looks.append((arguments[-1].tolist(), {name: x.clone() for name, x in belief.state_dict().items()}))
@@ -81,15 +70,70 @@ def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_
     repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
     path = train(aib_belief, repr_dir=repr_dir, num_episodes=20, num_updates=6, batch_episodes=4, val_every=2)
     fit, test = [15, 16, 17], [18, 19]  # of 20 episodes, a quarter of which is held out
+    trained = [index for index in read if len(index) == 4]
+    assert len(trained) == 6 and max(map(max, trained)) < 15
     assert [episodes for episodes, _ in looks] == [test] * 3 + [fit, test]
     stored = torch.load(path / "belief.pt", weights_only=True)
     phi = torch.load(Path(repr_dir) / "repr.pt", weights_only=True)["phi"]
     assert all(torch.equal(stored["belief"][f"phi.{name}"], x) for name, x in phi.items()), (
         "PPO's evaluation needs it for u"
     )
+    state = torch.from_numpy(np.load(Path(repr_dir) / "dataset" / "state.npy")[test])
+    encoder = aib_belief.StateEncoder(4, 16)
+    encoder.load_state_dict(phi)
+    assert torch.allclose(encoded[-1]["u"], encoder(state).mean, atol=1e-6), "the mean of phi(s)"
     stored = stored["belief"]
     assert all(torch.equal(stored[name], x) for name, x in looks[2][1].items())  # the last weights
     assert any((stored[name] != x).any() for name, x in looks[1][1].items())
+
+
+def note_episodes(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> list[list[int]]:
+    """The episodes that a script's EpisodeDataset is asked for, call by call."""
+    read, call = [], module.EpisodeDataset.__call__
+    monkeypatch.setattr(module.EpisodeDataset, "__call__", lambda self, x: read.append(x.tolist()) or call(self, x))
+    return read
+
+
+def test_believers_belief_gets_the_episodes_phi_and_statistics_of_aibs(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, repr_dir = note_episodes(monkeypatch, ppo_believer), toy_stages / f"{TOY}__aib_repr__1"
+    sizes = dict(num_updates=3, batch_episodes=4, num_envs=4, total_timesteps=40, num_minibatches=2)
+    path = train(ppo_believer, repr_dir=str(repr_dir), num_episodes=20, num_eval_episodes=2, **sizes)
+    trained = [index for index in read if len(index) == 4]
+    assert len(trained) == 3 and max(map(max, trained)) < 15
+    assert [index for index in read if len(index) == 2] == [[18, 19]] * 2
+    belief = torch.load(path / "belief.pt", weights_only=True)["belief"]
+    stage_1 = torch.load(repr_dir / "repr.pt", weights_only=True)
+    assert all(torch.equal(belief[f"phi.{name}"], x) for name, x in stage_1["phi"].items())
+    assert all(torch.equal(belief[f"history.{name}"], stage_1["norm"][name]) for name in stage_1["norm"])
+
+
+@pytest.mark.parametrize("script", ["aib_belief", "ppo_believer"])
+def test_belief_anneal_lets_the_learning_rate_fall_over_the_second_half(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    rates, step = [], torch.optim.Adam.step
+    monkeypatch.setattr(torch.optim.Adam, "step", lambda self: (rates.append(self.param_groups[0]["lr"]), step(self)))
+    sizes = dict(num_episodes=20, num_updates=6, batch_episodes=4, belief_lr=1e-3, belief_anneal=True)
+    if script == "ppo_believer":
+        sizes |= dict(num_envs=4, total_timesteps=40, num_minibatches=2, num_eval_episodes=2)
+    train(SCRIPTS[script], repr_dir=str(toy_stages / f"{TOY}__aib_repr__1"), **sizes)
+    assert rates[:6] == pytest.approx([1e-3, 1e-3, 1e-3, 1e-3, 2e-3 / 3, 1e-3 / 3])
+
+
+@pytest.mark.parametrize(
+    "variant",
+    [
+        dict(action_head="mse", history_joints=False, gru_layers=2),
+        dict(action_head="none", bptt_steps=3, image_norm="none", chrono_init=False, image_shift=1),
+    ],
+)
+def test_ablations_train(toy_task: Path, toy_stages: Path, variant: dict) -> None:
+    repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
+    path = train(aib_belief, repr_dir=repr_dir, num_episodes=20, num_updates=1, batch_episodes=4, **variant)
+    report = json.loads((path / "diagnostics.json").read_text())
+    assert len(report["u_r2_prior"]) == 11 and "flow_gain" not in report
 
 
 def test_an_earlier_stage_gets_what_it_needs_to_know(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -177,6 +177,12 @@ def other_dataset(**values: object) -> Callable[[], object]:
     return damage
 
 
+def rewrite_args(**values: object) -> Callable[[], object]:
+    """Other entries in the args.json of plain PPO's run."""
+    file = AGENT.with_name("args.json")
+    return lambda: file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
+
+
 STAGE_1 = dict(num_episodes=20, val_fraction=0.25, epochs=1, batch_size=50)
 STAGE_2 = dict(exp_name="again", num_updates=1)
 PPO = dict(num_envs=4, total_timesteps=40, num_eval_episodes=4, num_minibatches=2)
@@ -184,7 +190,6 @@ ONLY_EVALUATE = dict(evaluate=True, num_envs=4, num_eval_episodes=4, checkpoint=
 CASES = {  # name: (script, arguments, damage, words of the sentence)
     "nothing held out": (aib_repr, dict(val_fraction=0.0), None, ["--val-fraction 0.0", "--num-episodes"]),
     "all held out": (aib_repr, dict(val_fraction=1.0), None, ["--val-fraction 1.0"]),
-    "no disk for it": (aib_repr, dict(exp_name="big", num_episodes=10**10), None, ["has free", "--num-episodes"]),
     "dataset of another format": (aib_repr, STAGE_1, other_dataset(format=9), ["has format 9", "--overwrite"]),
     "dataset of more episodes": (aib_repr, STAGE_1, other_dataset(num_episodes=30), ["has num_episodes 30"]),
     "repr.pt cut short": (aib_belief, STAGE_2, cut(REPR_PT), ["repr.pt is damaged", "--overwrite"]),
@@ -213,6 +218,13 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
     "agent.pt cut short": (ppo_baseline, ONLY_EVALUATE, cut(AGENT), ["agent.pt is damaged"]),
     "checkpoint.pt cut short": (ppo_baseline, PPO, cut(CHECKPOINT), ["checkpoint.pt is damaged"]),
     "other arguments": (ppo_baseline, {**PPO, "gamma": 0.5}, None, ["gamma=0.99 there, 0.5 here", "--exp-name"]),
+    "run of another script": (ppo_baseline, PPO, rewrite_args(belief="x.pt"), ["belief=x.pt there, None here"]),
+    "killed while it was deleted": (
+        ppo_baseline,
+        PPO,
+        write(AGENT.with_name("args.json"), b"{}"),
+        ["begun with other arguments", "--overwrite"],
+    ),
     "runs is a file": (
         ppo_baseline,
         PPO,
@@ -309,6 +321,9 @@ def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.Cap
             train(ppo_aib, **PPO, num_episodes=20)
         refused((stop.value.code, *capfd.readouterr()), "began with another belief", "--overwrite")
     BELIEF_PT.unlink()
+    with pytest.raises(SystemExit) as stop:
+        train(ppo_aib, **PPO, num_episodes=20)
+    refused((stop.value.code, *capfd.readouterr()), "belief.pt does not exist")
     change(REPR_PT, seed=2)()
     with pytest.raises(SystemExit) as stop:
         train(aib_belief, num_episodes=20, num_updates=3, batch_episodes=4)
@@ -319,6 +334,7 @@ def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.Cap
     "script, wrong, words",
     [
         ("aib_repr", dict(val_fraction=0.0), ["--val-fraction 0.0"]),
+        ("aib_repr", dict(num_episodes=10**10), ["more than the disk has free", "--num-episodes"]),
         ("aib_belief", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
         ("ppo_aib", dict(belief="nope.pt"), ["nope.pt does not exist"]),
         ("ppo_believer", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
@@ -351,8 +367,12 @@ def test_overwrite_deletes_nothing_before_the_inputs_are_read(
 def test_overwrite_starts_again(folder: Path) -> None:
     leftover = AGENT.parent / "videos" / "old.mp4"
     leftover.write_text("old")
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir()
+    AGENT.with_name("linked").symlink_to(elsewhere)
     train(ppo_baseline, **{**PPO, "gamma": 0.5, "overwrite": True})
-    assert not leftover.exists() and json.loads((AGENT.parent / "args.json").read_text())["gamma"] == 0.5
+    assert not leftover.exists() and not AGENT.with_name("linked").exists() and elsewhere.exists()
+    assert json.loads((AGENT.parent / "args.json").read_text())["gamma"] == 0.5
 
 
 def test_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -188,16 +188,21 @@ def test_flow_loss_shapes_the_posterior_and_the_prior_only_through_the_kl() -> N
         return any(g is not None and g.abs().sum() > 0 for g in grads)
 
     assert moved(losses["action"], model["posterior"]) and moved(losses["action"], model["head"])
+    assert moved(losses["nll"], model["posterior"]), "z is a sample that lets the gradient through"
     assert not moved(losses["action"], model["belief"].prior)
     assert not moved(losses["nll"], model["belief"].prior)
     assert moved(losses["kl"], model["belief"].prior)
+    samples = aib_belief.belief_losses(model, batch, losses_args(fm_latent="sample"))
+    assert moved(samples["action"], model["posterior"])
+    believer = nn.ModuleDict({"belief": ppo_believer.BelieverBelief(CONFIG), "posterior": model["posterior"]})
+    assert moved(ppo_believer.believer_losses(believer, batch, losses_args())["nll"], model["posterior"])
 
 
 def test_believer_has_a_fixed_prior() -> None:
     torch.manual_seed(0)
     belief, h = ppo_believer.BelieverBelief(CONFIG), torch.randn(T, B, 256)
     model = nn.ModuleDict({"belief": belief, "posterior": belief_model()["posterior"]})
-    batch, args = belief_batch(), losses_args()
+    batch, args = belief_batch(), losses_args(beta=0.5)
     torch.manual_seed(1)
     losses = ppo_believer.believer_losses(model, batch, args)
     torch.manual_seed(1)
@@ -206,7 +211,7 @@ def test_believer_has_a_fixed_prior() -> None:
     nll = -belief.decoder(torch.cat([q.rsample(), history], -1)).log_prob(batch["u"]).sum(-1).mean()
     kl = (0.5 * (q.mean**2 + q.stddev**2 - 1) - q.stddev.log()).sum(-1).mean()
     assert torch.allclose(losses["nll"], nll) and torch.allclose(losses["kl"], kl)
-    assert torch.allclose(losses["total"], nll + args.beta * kl)
+    assert torch.allclose(losses["total"], nll + 0.5 * kl)
     z = torch.randn(B, 30, 5)
     d = belief.decoder(torch.cat([z, h[0, :, None].expand(-1, 30, -1)], -1))
     assert torch.allclose(belief.decode(h[0], z).mean, d.mean, atol=1e-5)
@@ -313,6 +318,13 @@ def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_
     assert torch.allclose(history["history.joints_std"], joints.std(0, correction=0), atol=1e-4)
     gate = history["history.gru.bias_ih_l0"][256:512]
     assert gate.min() > -0.1 and 1 < gate.max() < math.log(9) + 0.1, "chrono_init, and three updates"
+    model = torch.load(toy_stages / f"{TOY}__aib_repr__1" / "checkpoint.pt", weights_only=True)["model"]
+    dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
+    rewards, state = (torch.from_numpy(np.load(dataset / f"{name}.npy")[:15]) for name in ("rewards", "state"))
+    assert torch.allclose(model["g.reward_mean"], rewards.mean(), atol=1e-5)
+    assert torch.allclose(model["g.reward_std"], rewards.std(correction=0), atol=1e-5)
+    assert torch.allclose(model["phi.mean"], state.mean((0, 1)), atol=1e-5)
+    assert torch.allclose(model["phi.std"], state.std((0, 1), correction=0).clip(0.05), atol=1e-5)
 
 
 def test_psi_without_images_sees_the_joints_alone(toy_stages: Path) -> None:
@@ -331,18 +343,30 @@ def test_psi_without_images_sees_the_joints_alone(toy_stages: Path) -> None:
 
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:
     psi, history = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4), aib_belief.HistoryEncoder(CONFIG)
-    rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.zeros(2, 7)
+    rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.randn(2, 7)
     for encoder, encode in (
         (psi, lambda x: psi(x, joints).mean),
         (history, lambda x: history.embed(x, joints)),
     ):
         plain = encode(rgb)
-        encoder.image_mean, encoder.image_std = torch.full(IMAGE, 50.0), torch.tensor(255.0)
+        encoder.image_mean, encoder.image_std = torch.full(IMAGE, 50.0), torch.tensor(510.0)
         assert not torch.allclose(encode(rgb), plain, atol=1e-4)
-        assert torch.allclose(encode(rgb + 50), plain, atol=1e-5)
+        assert torch.allclose(encode(2 * rgb + 50), plain, atol=1e-5)
         weight = encoder.cnn.out[0].weight
         gram = weight.T @ weight if len(weight) > weight.shape[1] else weight @ weight.T
         assert torch.allclose(gram, 2 * torch.eye(len(gram)), atol=1e-4)
+
+
+def test_state_and_joints_are_standardised_in_phi_and_psi() -> None:
+    phi, psi = aib_repr.StateEncoder(5, 4), aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4, images=False)
+    state, joints = torch.randn(B, 5), torch.randn(B, 7)
+    plain, plain_joints = phi(state).mean, psi(None, joints).mean
+    phi.mean.fill_(3.0), phi.std.fill_(2.0), psi.joints_mean.fill_(3.0), psi.joints_std.fill_(2.0)
+    assert torch.allclose(phi(2 * state + 3).mean, plain, atol=1e-5)
+    assert torch.allclose(psi(None, 2 * joints + 3).mean, plain_joints, atol=1e-5)
+    gaussian = aib_repr.GaussianMLP(5, [8], 4, min_std=0.1)
+    nn.init.constant_(gaussian.net[-1].bias, -100.0)
+    assert torch.allclose(gaussian(state).stddev, torch.tensor(0.1))
 
 
 def test_readout_score_on_features_of_known_content() -> None:
@@ -372,9 +396,13 @@ def test_report_of_a_belief_that_knows_and_of_its_chance() -> None:
         seen = {"u": u, "u_prior": u + 0.1, "u_posterior": u, "h": torch.cat([u, known], -1), "cue": cue}
         seen |= {"nll_prior": torch.ones(40, T + 1), "nll_posterior": torch.zeros(40, T + 1)}
         seen |= {"z_mean": torch.randn(40, T + 1, 5), "actions": torch.rand(40, T, A)}
+        seen["z_mean"][:, 1:, :A] = seen["actions"]
+        seen["u_prior"][:, -1] = torch.randn_like(u[:, -1])
         report = aib_belief.probe_belief(*({name: x[part] for name, x in seen.items()} for part in (SELECT, REPORT)))
         assert report["cue_chance"] == pytest.approx(chance)
         assert (report["nll_prior"], report["nll_posterior"]) == (1, 0)
+        assert report["cue_from_particle"][-1] < 0.8 < 0.95 < report["cue_from_u"][-1]
+        assert report["action_readout"] > 0.9, "a_t from z_t and z_t+1"
         assert min(report["cue_from_h"]) > 0.95 and min(report["u_r2_posterior"]) == 1
         left = 0.01 * cue[REPORT].numel() / (cue[REPORT] - cue[REPORT].mean(0)).square().sum()
         assert report["u_r2_prior"][0] == pytest.approx(1 - left.item(), abs=1e-5)
@@ -415,6 +443,7 @@ def test_belief_aggregator_is_the_papers_formula() -> None:
     agent = ppo_aib.Agent(spaces(IMAGE, 7, A), ppo_aib.AIBBelief(CONFIG), ppo_aib.Args())
     obs = {"rgb": torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8), "joints": torch.randn(B, 7)}
     particles = torch.randn(B, 30, 4)
+    agent.joints_norm.running_mean.fill_(3.0), agent.joints_norm.running_var.fill_(4.0)
     nn.init.orthogonal_(agent.actor[-1].weight, 3.0)  # else too near 0 to tell tanh from nothing
     policy, value = agent({**obs, "particles": particles})
     assert policy.mean.shape == (B, A) and value.shape == (B,)
@@ -425,6 +454,7 @@ def test_belief_aggregator_is_the_papers_formula() -> None:
     assert torch.allclose(value, agent.critic(x)[:, 0], atol=1e-6)
     plain = ppo_baseline.Agent(spaces(IMAGE, 7, A), ppo_baseline.Args())
     nn.init.orthogonal_(plain.actor[-1].weight, 3.0)
+    plain.joints_norm.running_mean.fill_(3.0), plain.joints_norm.running_var.fill_(4.0)
     x = torch.cat([plain.cnn(obs["rgb"].float() / 255), plain.joints(plain.joints_norm(obs["joints"]))], -1)
     assert torch.allclose(plain(obs)[0].mean, torch.tanh(plain.actor(x)), atol=1e-6)
 

@@ -1,7 +1,6 @@
 """Stage 3 and the baselines on the toy task: what an iteration is made of, and that it depends on nothing else."""
 
 import csv
-import math
 import shutil
 import sys
 import weakref
@@ -179,6 +178,7 @@ def test_u_r2_tells_what_the_belief_knows_of_the_episodes_just_played(
     for size, expected in ((0.0, 1.0), (0.5**0.5, 0.5)):  # noqa: B007  (informed reads it)
         metrics, _ = module.evaluate(toy.make_envs(args), agent, args)
         assert metrics["u_r2"] == pytest.approx(expected, abs=0.1)
+    assert torch.equal(played[0]["particles"], played[1]["particles"]), "the same noise at every evaluation"
     assert list(metrics)[-2:] == ["u_r2", "u_r2_at_end"] and metrics["u_r2_at_end"] < 1
     envs = toy.make_envs(args)
     for i in range(0, 16, 3):  # three episodes at a time, as the rollout plays them
@@ -213,7 +213,7 @@ def test_exploration_noise_is_coloured_and_standard_normal_at_every_step() -> No
 def test_the_three_methods_explore_with_the_same_noise(toy_stages: Path) -> None:
     drawn = []
     for script in METHODS:
-        module, policy = SCRIPTS[script], []
+        module, seen = SCRIPTS[script], []
         args = module.Args(env_id=TOY, noise_beta=0.7, **small(module, toy_stages))
         if script == "ppo_baseline":
             agent = module.Agent(toy.ToyMemory(1), args)
@@ -221,11 +221,18 @@ def test_the_three_methods_explore_with_the_same_noise(toy_stages: Path) -> None
             stored = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)
             belief = ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief
             agent = module.Agent(toy.ToyMemory(1), belief(stored["config"]), args)
-        agent.register_forward_hook(lambda _, inputs, output, seen=policy: seen.append(output[0]))
+        agent.register_forward_hook(lambda _, inputs, output, seen=seen: seen.append((inputs[0]["joints"], *output)))
         for seeds in (np.arange(3), np.arange(3, 6)):  # one round each
             data = module.rollout(toy.make_envs(args), agent, args, seeds)
-            steps = zip(data["actions"], policy[-11:], strict=False)
+            joints, policies, values = zip(*seen[-11:], strict=True)
+            assert [x[0, 2].item() for x in joints] == pytest.approx([t / 10 for t in range(11)])
+            assert torch.equal(data["values"], torch.stack(values)), "of o_0 to o_T"
+            steps = zip(data["actions"], policies, strict=False)
             drawn.append(torch.stack([(action - p.mean) / p.stddev for action, p in steps]))
+            noise = module.colored_noise(0.7, (3, 2, 10), np.random.default_rng(seeds)).transpose(2, 0, 1)
+            assert np.allclose(drawn[-1], noise, atol=1e-4), "coloured over time"
+        data = module.rollout(toy.make_envs(args), agent, args, np.arange(3), deterministic=True)
+        assert torch.equal(data["actions"], torch.stack([p.mean for _, p, _ in seen[-11:-1]]))
     for other in (drawn[2], drawn[4]):
         assert torch.allclose(drawn[0], other, atol=1e-4)
     assert (drawn[0] - drawn[1]).abs().max() > 0.1, "other episodes, other noise"
@@ -251,7 +258,8 @@ def test_an_iteration_plays_new_episodes_and_learns_from_each_step_with_its_own_
     (_, seeds, data), (_, other_seeds, other) = (one for one in played if one[0])
     evaluated, evaluated_again = (one[1] for one in played if not one[0])
     assert len({*seeds, *other_seeds, *evaluated}) == 8 + 8 + 6 and evaluated == evaluated_again
-    assert max(seeds + other_seeds) < 2**30 <= min(evaluated)
+    assert seeds == [1_000_008 + i for i in range(8)] and max(other_seeds) < 2**30
+    assert min(evaluated) >= 2**30 + 2**29, "stage 1's lie below"
     key, other_key = data["logprobs"], other["logprobs"]  # tells the noise, whatever the policy's means
     assert min(key.std(0).min(), key.std(1).min(), (key - other_key).std()) > 0.1, "fresh noise at every step"
 
@@ -389,18 +397,42 @@ def test_a_finished_run_goes_on_as_if_it_had_been_long_from_the_start(
     assert all(torch.equal(x, y) for x, y in zip(agents[0].values(), agents[1].values(), strict=True))
 
 
-def test_evaluate_takes_over_what_the_episodes_depend_on(toy_task: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = train(ppo_baseline, **SMALL, init_std=0.2) / "agent.pt"
-    stored = torch.load(agent, weights_only=True)["agent"]
-    assert (stored["log_std"] - math.log(0.2)).abs().max() < 0.05, "it has been trained a little"
-    seen = []
-    monkeypatch.setattr(ppo_baseline, "make_envs", lambda args: seen.append(args) or toy.make_envs(args))
-    options = dict(evaluate=True, checkpoint=str(agent), num_eval_episodes=4, num_workers=2)
-    seeds, rollout = [], ppo_baseline.rollout
-    monkeypatch.setattr(ppo_baseline, "rollout", lambda *args, **how: seeds.extend(args[3]) or rollout(*args, **how))
-    ppo_baseline.evaluate_checkpoint(ppo_baseline.Args(num_envs=3, amp=True, **options))
-    assert (seen[0].env_id, seen[0].num_envs, seen[0].amp) == (TOY, SMALL["num_envs"], False)
-    assert seeds == [ppo_baseline.EVAL_SEED + 2**20 + i for i in range(4)], "no episode of any training's evaluations"
+@pytest.mark.parametrize("script", METHODS)
+def test_evaluate_plays_test_episodes_with_the_stored_agent(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    module, played = SCRIPTS[script], []
+    changes = dict(num_particles=5, sample_decoder=False)
+    if script == "ppo_baseline":
+        changes = dict(image_size=40, robot_triangles=7)
+    file = train(module, **small(module, toy_stages, **changes)) / "agent.pt"
+    rollout = module.rollout
+    monkeypatch.setattr(module, "rollout", lambda *args, **how: played.append((args, how)) or rollout(*args, **how))
+    options = dict(evaluate=True, checkpoint=str(file), num_eval_episodes=4, num_workers=2)
+    module.evaluate_checkpoint(module.Args(num_envs=3, amp=True, **options))
+    (((_, agent, args, seeds), how),) = played
+    assert (args.env_id, args.num_envs, args.amp, how) == (TOY, SMALL["num_envs"], False, {"deterministic": True})
+    assert all(getattr(args, name) == value for name, value in changes.items())
+    stored = torch.load(file, weights_only=True)["agent"]
+    assert all(torch.equal(x, stored[name]) for name, x in agent.state_dict().items())
+    assert list(seeds) == [2**30 + 2**29 + 2**20 + i for i in range(4)], "no episode of any training's evaluations"
+
+
+@pytest.mark.parametrize("script", METHODS)
+def test_gradients_are_clipped_before_the_step(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    norms, step = [], torch.optim.Adam.step
+
+    def watched_step(self: torch.optim.Adam) -> None:
+        if len(self.param_groups) == 2:  # PPO's, not that of Believer's belief
+            grads = [x.grad for group in self.param_groups for x in group["params"] if x.grad is not None]
+            norms.append(torch.stack([grad.norm() for grad in grads]).norm().item())
+        step(self)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", watched_step)
+    train(SCRIPTS[script], **small(SCRIPTS[script], toy_stages, max_grad_norm=1e-3, target_kl=1e9))
+    assert norms == pytest.approx([1e-3] * 16, rel=0.01)
 
 
 @pytest.mark.parametrize("script", METHODS)
