@@ -826,6 +826,8 @@ def check_run(args: Args) -> Path:
     path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     if (path / "args.json").exists() and not args.overwrite:
         recorded, given, changed = json.loads((path / "args.json").read_text()), asdict(args), []
+        if not recorded:
+            fail(f"{path} is half deleted, by a run with --overwrite that was stopped; give --overwrite again")
         for name in recorded | given:  # another script's run has others
             if name not in MAY_DIFFER and recorded.get(name) != given.get(name):
                 changed.append(f"{name}={recorded.get(name)} there, {given.get(name)} here")
@@ -844,7 +846,7 @@ def open_run(path: Path, args: Args) -> None:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
         if args.overwrite:
-            save(recorded, b"{}")  # no run has these: what a kill leaves half deleted is not resumed
+            save(recorded, b"{}")  # what a kill leaves half deleted must not be resumed
             for file in set(path.iterdir()) - {recorded}:
                 shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
         save(recorded, json.dumps(asdict(args), indent=2).encode())

@@ -223,7 +223,7 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
         ppo_baseline,
         PPO,
         write(AGENT.with_name("args.json"), b"{}"),
-        ["begun with other arguments", "--overwrite"],
+        ["is half deleted", "--overwrite"],
     ),
     "runs is a file": (
         ppo_baseline,
