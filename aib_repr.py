@@ -348,7 +348,7 @@ def main(args: Args) -> None:
     num_val = round(args.num_episodes * args.val_fraction)
     if not 4 <= num_val < args.num_episodes:  # stage 2 fits read-outs on half of them and tests them on the other
         fail(
-            f"--val-fraction {args.val_fraction} must hold out 4 of --num-episodes {args.num_episodes} or more, not all"
+            f"--val-fraction {args.val_fraction} must hold out 4 or more of --num-episodes {args.num_episodes}, not all"
         )
     path, device = check_run(args), torch.device(args.device)
     if (path / "repr.pt").exists() and not args.overwrite:
