@@ -140,13 +140,18 @@ def last_three(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[float]:
     return [values[-3:].mean() for _, values in curves.values()]
 
 
+def bootstrap_interval(values: list[float]) -> tuple[float, float]:
+    """95 % bootstrap interval of the mean."""
+    return scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+
+
 def summarise(values: list[float]) -> str:
     """Mean (each seed); from five on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
     if len(values) < 2:
         return "".join(f"{value:.2f}" for value in values)
     if len(values) < 5:
         return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in values)})"
-    low, high = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    low, high = bootstrap_interval(values)
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} [{low:.2f}, {high:.2f}]"
 
 
@@ -195,6 +200,27 @@ def agents_table(table: str, evals: list[dict], tests: list[dict]) -> str:
             rows.append([task.removesuffix("-v0"), method, *run, *cells])
     head = ["task", "method", "setting", "seeds", "steps before", "PPO steps", *METRICS[:2], "test: once", "at end"]
     return markdown(head, rows)
+
+
+def pairs_table(evals: list[dict]) -> str:
+    """AIB and Believer of one task, setting and seed at equal steps, and the mean of their differences."""
+    cells, differences = defaultdict(list), {metric: [] for metric in METRICS[:2]}
+    for task, setting in rows_of("agents") + rows_of("choices"):
+        for metric in METRICS[:2]:
+            curves = [by_seed(evals, metric, task=task, setting=setting, method=m) for m in ("AIB", "Believer")]
+            for seed in sorted(curves[0].keys() & curves[1].keys()):
+                last = min(curve[seed][0][-1] for curve in curves)
+                aib, believer = (values[steps <= last][-3:].mean() for steps, values in (c[seed] for c in curves))
+                differences[metric].append(aib - believer)
+                run = (task.removesuffix("-v0"), setting, seed, f"{last:,.0f}")
+                cells[run] += [f"{aib:.2f}", f"{believer:.2f}", f"{aib - believer:+.2f}"]
+    rows = [[*run, *values] for run, values in cells.items()]
+    total = [f"mean of {len(rows)} pairs", "", "", ""]
+    for values in differences.values():
+        low, high = bootstrap_interval(values)
+        total += ["", "", f"{np.mean(values):+.2f} [{low:+.2f}, {high:+.2f}]"]
+    head = ["task", "setting", "seed", "PPO steps", "once: AIB", "Believer", "difference"]
+    return markdown([*head, "at end: AIB", "Believer", "difference"], [*rows, total])
 
 
 def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str) -> str:
@@ -349,7 +375,7 @@ def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
     evals, beliefs = read("eval.csv"), read("beliefs.csv")
     tables = {name: agents_table(name, evals, read("test.csv")) for name in ("agents", "choices")}
-    tables |= {"results": results_table(evals), "beliefs": beliefs_table(beliefs)}
+    tables |= {"results": results_table(evals), "pairs": pairs_table(evals), "beliefs": beliefs_table(beliefs)}
     tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "shift": shift_table(evals)}
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
