@@ -652,10 +652,15 @@ def parse_args() -> Args:
     if "/" in args.exp_name:
         fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
+        flag = f"--{name.replace('_', '-')} {value}"
         low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
         if isinstance(value, int | float) and not low <= value <= high:
             bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
-            fail(f"--{name.replace('_', '-')} {value} must be {bounds}")
+            fail(f"{flag} must be {bounds}")
+        try:
+            str(value).format(**vars(args))
+        except (IndexError, KeyError, ValueError):
+            fail(f"{flag} has braces around what is no argument's name; {{env_id}} and {{seed}} are")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):

@@ -116,6 +116,12 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("aib_belief", ["--image-shift", "-1"], ["--image-shift -1", "at least 0"]),
         ("aib_repr", ["--val-fraction", "1.5"], ["--val-fraction 1.5", "between 0 and 1"]),
         ("ppo_believer", ["--num-minibatches", "0"], ["--num-minibatches 0", "at least 1"]),
+        (
+            "ppo_aib",
+            ["--belief", "runs/{env}__aib_belief__1/belief.pt"],
+            ["--belief runs/{env}__", "{env_id} and {seed}"],
+        ),
+        ("aib_belief", ["--repr-dir", "runs/{"], ["--repr-dir runs/{ has braces"]),
         ("ppo_baseline", ["--device", "cuda"], ["no CUDA device", "--device cpu"]),
     ],
 )
