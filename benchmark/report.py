@@ -195,7 +195,10 @@ def agents_table(table: str, evals: list[dict], tests: list[dict]) -> str:
             steps_before = 0 if method == "PPO" else int(before[setting])
             cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
             for metric in METRICS[:2]:
-                cells.append(summarise([values[-1] for _, values in by_seed(tests, metric, **chosen).values()]))
+                tested = by_seed(tests, metric, **chosen)
+                cells.append(summarise([values[-1] for _, values in tested.values()]))
+                if 0 < len(tested) < len(curves):
+                    cells[-1] += f" (seed {', '.join(tested)})"
             run = [setting, ", ".join(curves), f"{steps_before:,}", f"{steps:,.0f}"]
             rows.append([task.removesuffix("-v0"), method, *run, *cells])
     head = ["task", "method", "setting", "seeds", "steps before", "PPO steps", *METRICS[:2], "test: once", "at end"]
@@ -275,8 +278,8 @@ def oracle_table(evals: list[dict]) -> str:
     return markdown(["task", "the policy sees", "setting", "seeds", *[f"{step:,}" for step in ORACLE_STEPS]], rows)
 
 
-def shift_table(evals: list[dict]) -> str:
-    """R² of u at the last step of the agents' own episodes: first evaluation, lowest, last; and success at the last."""
+def shift_table(evals: list[dict], tests: list[dict]) -> str:
+    """R² of u at the last step of the agents' own episodes: first evaluation, lowest, last; on test episodes."""
     rows = []
     for task, setting in rows_of("agents") + rows_of("choices"):
         for method in METHODS.values():
@@ -284,10 +287,12 @@ def shift_table(evals: list[dict]) -> str:
             success = by_seed(evals, "success_once", **chosen)
             for seed, (steps, known) in by_seed(evals, "u_r2_at_end", **chosen).items():
                 cells = [seed, f"{steps[-1]:,.0f}"]
-                cells += [f"{value:.2f}" for value in (known[0], known.min(), known[-1], success[seed][1][-1])]
-                rows.append([task.removesuffix("-v0"), method, setting, *cells])
-    head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, first", "lowest", "last", "success_once, last"]
-    return markdown(head, rows)
+                cells += [f"{value:.2f}" for value in (known[0], known.min(), known[-1])]
+                tested = by_seed(tests, "u_r2_at_end", seed=seed, **chosen)
+                cells.append(f"{tested[seed][1][-1]:.2f}" if tested else "")
+                rows.append([task.removesuffix("-v0"), method, setting, *cells, f"{success[seed][1][-1]:.2f}"])
+    head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, first", "lowest", "last", "test"]
+    return markdown([*head, "success_once, last"], rows)
 
 
 # ---------------------------------------------------------------- figures
@@ -373,10 +378,10 @@ def replace_tables(page: str, tables: dict[str, str]) -> str:
 
 def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
-    evals, beliefs = read("eval.csv"), read("beliefs.csv")
-    tables = {name: agents_table(name, evals, read("test.csv")) for name in ("agents", "choices")}
+    evals, tests, beliefs = read("eval.csv"), read("test.csv"), read("beliefs.csv")
+    tables = {name: agents_table(name, evals, tests) for name in ("agents", "choices")}
     tables |= {"results": results_table(evals), "pairs": pairs_table(evals), "beliefs": beliefs_table(beliefs)}
-    tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "shift": shift_table(evals)}
+    tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "shift": shift_table(evals, tests)}
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
     learning_curves(evals, output / "benchmark" / "results" / "learning_curves.png")
