@@ -104,9 +104,13 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
     joints[1, -1] += 1
     policy, value = agent({"joints": joints})
     assert policy.mean.shape == (2, 8) and value[0] != value[1], "it sees the state"
+    joints[:, -1] = torch.tensor([20.0, 2000.0])
+    value = agent({"joints": joints})[1]
+    assert torch.allclose(value[0], value[1]), "inputs are clipped"
     phi = aib_belief.StateEncoder(len(info["state"]), 16)
     agent = true_state.StateAgent(shown_spaces, ppo_baseline.Args(), phi)
     assert agent.joints[0].in_features == 25 + 16
+    joints[:, -1] = torch.tensor([0.0, 1.0])
     first = agent({"joints": joints})[1]
     phi.mean[-1] += 1  # now the second state is to phi what the first was
     assert torch.allclose(agent({"joints": joints})[1][1], first[0]), "it sees u"
