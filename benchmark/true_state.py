@@ -94,10 +94,10 @@ class StateAgent(nn.Module):
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of joints (B, 25 + D) and rgb (B, H, W, 3) uint8."""
-        x = self.joints_norm(obs["joints"]).clamp(-10, 10)  # a ball that is hit spins at hundreds of deviations
+        x = self.joints_norm(obs["joints"])
         if self.phi:
             x = torch.cat([x[:, :25], self.phi(obs["joints"][:, 25:]).mean], -1)
-        x = self.joints(x)
+        x = self.joints(x.clamp(-10, 10))  # a ball that is hit spins at hundreds of deviations
         if self.cnn:
             x = torch.cat([self.cnn(obs["rgb"].float().div_(255)), x], -1)
         mean = torch.tanh(self.actor(x))

@@ -114,6 +114,9 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
     first = agent({"joints": joints})[1]
     phi.mean[-1] += 1  # now the second state is to phi what the first was
     assert torch.allclose(agent({"joints": joints})[1][1], first[0]), "it sees u"
+    joints[:, -1] = torch.tensor([1e9, 2e9])
+    value = agent({"joints": joints})[1]
+    assert torch.allclose(value[0], value[1]), "u is clipped"
     shown = true_state.ShowState(env, target=True)
     shown.reset(seed=3)
     for _ in range(12):  # until the objects stand on the table
