@@ -328,7 +328,7 @@ def learning_curves(evals: list[dict], path: Path) -> None:
     for task, setting in rows_of("results"):
         if by_seed(evals, "success_once", task=task, setting=setting):
             panels.setdefault(task, setting)
-    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 3.4), layout="constrained", sharey=True)
+    figure, axes = plt.subplots(1, len(panels), figsize=(12, 3.4), layout="constrained", sharey=True)
     for ax, (task, setting) in zip(axes, panels.items(), strict=True):
         seeds = []
         for method in METHODS.values():
@@ -340,7 +340,8 @@ def learning_curves(evals: list[dict], path: Path) -> None:
             shown = steps <= 120_000
             label = "AIB, white noise, raw rewards and joints (1 seed)"
             ax.plot(steps[shown], values[shown], color=COLOURS["AIB"], linestyle="--", label=label)
-        ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
+        if task in CHANCE:
+            ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
         ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}")
         ax.set(xlabel="PPO steps", ylim=(0, 1.02))
     axes[0].set_ylabel("success_once")
