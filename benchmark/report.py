@@ -24,6 +24,7 @@ import tyro
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+from matplotlib.ticker import EngFormatter  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmark" / "results"
@@ -344,6 +345,7 @@ def learning_curves(evals: list[dict], path: Path) -> None:
             ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
         ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}")
         ax.set(xlabel="PPO steps", ylim=(0, 1.02))
+        ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 100k
     axes[0].set_ylabel("success_once")
     save_figure(figure, axes, path)
 
