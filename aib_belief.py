@@ -5,8 +5,8 @@ tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) sh
 that shape to the prior, which is what the robot has when it acts.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
-Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt, or --repr-dir; where
-         the former has no repr.pt, aib_repr.py runs first
+Reads:   --repr-dir, by default runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where the default has no
+         repr.pt, aib_repr.py runs first
 Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, TensorBoard events; args.json and
          checkpoint.pt to resume
 """
@@ -79,7 +79,7 @@ class Args:
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """random episodes of stage 1, which collects them if they are missing; a tenth is held out"""
+    """random episodes of stage 1, which collects them if they are missing; it holds a tenth out"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 3) are taken to be updates"""
     batch_episodes: int = 256
@@ -111,7 +111,7 @@ class Args:
     image_shift: int = 0
     """shift each episode's images by up to this many pixels while the belief is trained, against overfitting"""
     belief_amp: bool = BFLOAT16
-    """image network in bfloat16 while the belief is trained"""
+    """image network in bfloat16 in the training of the belief and its validation"""
     val_every: int = 50
     """updates between checkpoints, each with a validation"""
 
@@ -264,13 +264,14 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int
     All frames go through the CNN at once, or, where they are more than CNN_CHUNK, in chunks with gradient
     checkpointing. bptt_steps truncates back-propagation through time.
     """
-    frames = [batch[name].flatten(0, 1).split(CNN_CHUNK) for name in ("rgb", "joints")]
-    chunks = list(zip(*frames, strict=True))
-    if len(chunks) == 1:
-        x = history.embed(*chunks[0])
+    rgb, joints = batch["rgb"].flatten(0, 1), batch["joints"].flatten(0, 1)
+    if len(rgb) <= CNN_CHUNK:
+        x = history.embed(rgb, joints)
     else:
-        recompute = torch.utils.checkpoint.checkpoint
-        x = torch.cat([recompute(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
+        embedded = []
+        for chunk in zip(rgb.split(CNN_CHUNK), joints.split(CNN_CHUNK), strict=True):
+            embedded.append(torch.utils.checkpoint.checkpoint(history.embed, *chunk, use_reentrant=False))
+        x = torch.cat(embedded)
     outputs, hidden = [], None
     for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
         h, hidden = history(piece, hidden)
@@ -355,12 +356,8 @@ def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    default = Args.repr_dir  # a directory of another name is not made here
-    if args.small:
-        default = SMALL["repr_dir"]
-    if args.quick:
-        default = QUICK["repr_dir"]
-    if args.repr_dir == default and not (path / "repr.pt").exists():
+    made_here = (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"])  # a directory of another name is not
+    if args.repr_dir in made_here and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
@@ -404,7 +401,7 @@ def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
 def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> dict[str, Tensor]:
     """What the belief makes of episodes index (E,).
 
-    h (E, T+1, 256); u (E, T+1, u_dim), actions (E, T, A), cue (E, K) as they were
+    h (E, T+1, 256); u (E, T+1, u_dim), actions (E, T, A), cue (E, K): the episodes' own
     z_mean (E, T+1, z_dim): mean of q(z|u,h)
     u_prior (E, T+1, u_dim): mean of 30 particles, decoded samples of p(z|h); u_posterior: z_mean decoded
     nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: low also where the
@@ -443,11 +440,15 @@ def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
         residual = (test["u"] - test[f"u_{name}"]).square().sum((0, 2))
         report[f"u_r2_{name}"] = (1 - residual / total).tolist()
     for name, source in (("h", "h"), ("particle", "u_prior"), ("u", "u")):
-        steps = zip(fit[source].unbind(1), test[source].unbind(1), strict=True)
-        report[f"cue_from_{name}"] = [probe_score(x, fit["cue"], x_test, test["cue"]) for x, x_test in steps]
-    pairs, pairs_test = (torch.cat([x["z_mean"][:, :-1], x["z_mean"][:, 1:]], -1).flatten(0, 1) for x in (fit, test))
-    actions, actions_test = (x["actions"].flatten(0, 1) for x in (fit, test))
-    report["action_readout"] = probe_score(pairs, actions, pairs_test, actions_test)
+        scores = []
+        for t in range(test[source].shape[1]):
+            scores.append(probe_score(fit[source][:, t], fit["cue"], test[source][:, t], test["cue"]))
+        report[f"cue_from_{name}"] = scores
+    pairs = []
+    for part in (fit, test):
+        z_pairs = torch.cat([part["z_mean"][:, :-1], part["z_mean"][:, 1:]], -1)
+        pairs += [z_pairs.flatten(0, 1), part["actions"].flatten(0, 1)]
+    report["action_readout"] = probe_score(*pairs)
     cue = fit["cue"][:, fit["cue"].amax(0) > fit["cue"].amin(0)]
     report["cue_chance"] = 0.0
     if cue.numel() and are_classes(cue):
@@ -481,8 +482,8 @@ def main(args: Args) -> None:
     episodes, stored = load_episodes(args)
     open_run(path, args)
     # of the held-out episodes, linear probes are fitted on one half and tested on the other
-    inds, num_val = np.arange(args.num_episodes), stored["num_val"]
-    train, fit_on, test_on = inds[:-num_val], inds[-num_val : -(num_val // 2)], inds[-(num_val // 2) :]
+    num_val = stored["num_val"]
+    train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-num_val, -(num_val // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {
@@ -565,7 +566,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
-# what a script has of these is the same in all
+# identical in all scripts that have them
 
 
 def fail(message: str) -> NoReturn:

@@ -433,7 +433,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
-# the same in every script that simulates
+# identical in the four scripts that simulate
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -482,7 +482,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
-# the next three only make a CPU faster
+# the next three make a CPU faster, at the cost of slightly different pictures
 
 
 @contextmanager
@@ -490,7 +490,8 @@ def shaders_without_brdf_table() -> Iterator[None]:
     """Start SAPIEN without its table for reflections of a sky, most of the start on a CPU: these tasks have no sky."""
     set_shader_dir = sapien.render.set_camera_shader_dir
     with tempfile.TemporaryDirectory() as folder:
-        pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
+        pack = f"{folder}/minimal"
+        shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", folder, dirs_exist_ok=True)
         for file in Path(pack).glob("*.frag"):
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
@@ -604,7 +605,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
-# what a script has of these is the same in all
+# identical in all scripts that have them
 
 
 def fail(message: str) -> NoReturn:

@@ -5,7 +5,8 @@ turns them into a vector that joins image and joints as the input of actor and c
 
 Usage:   python ppo_aib.py --env-id InterceptFast-v0
          python ppo_aib.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_aib__1/agent.pt
-Reads:   runs/{env_id}__aib_belief__{seed}/belief.pt, or --belief; if the former is missing, aib_belief.py runs first
+Reads:   --belief, by default runs/{env_id}__aib_belief__{seed}/belief.pt; where the default is missing, aib_belief.py
+         runs first
 Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, TensorBoard events; args.json and
          checkpoint.pt to resume; with --evaluate evaluation.json and .mp4 beside agent.pt
 """
@@ -93,7 +94,7 @@ class Args:
     belief: str = "runs/{env_id}__aib_belief__{seed}/belief.pt"
     """belief of stage 2"""
     num_episodes: int = 2000
-    """random episodes of stage 1, a tenth of them held out; handed to the earlier stages where they run first"""
+    """random episodes of stage 1, which holds a tenth out; handed to the earlier stages where they run first"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
     sample_decoder: bool = True
@@ -292,7 +293,7 @@ class Agent(nn.Module):
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # a running standardiser: mean of all iterations' means and variances; without updates it changes nothing
+        # a running standardiser: mean of all iterations' means and variances; before the first it changes nothing
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -370,7 +371,7 @@ def rollout(
     V(o_T) last; if deterministic also the privileged state, which the evaluation compares the belief with.
     The particles are kept because fresh ones would change the probability ratio of the update. Episodes are played in
     rounds of envs.num_envs scenes, at most args.num_envs on physx_cpu; all noise is drawn before the first round, so
-    that the size of a round changes results by rounding only. info: see PrivilegedInfoWrapper.
+    that the size of a round changes results by rounding only.
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
@@ -424,12 +425,8 @@ def rollout(
 def load_belief(args: Args, resume: bool) -> dict:
     """Read stage 2's belief.pt, made first where it is missing; a resumed run needs the one that it began with."""
     file = Path(args.belief.format(**vars(args)))
-    default = Args.belief  # a file of another name is not made here
-    if args.small:
-        default = SMALL["belief"]
-    if args.quick:
-        default = QUICK["belief"]
-    if args.belief == default and not file.exists() and not resume:
+    made_here = (Args.belief, SMALL["belief"], QUICK["belief"])  # a file of another name is not
+    if args.belief in made_here and not file.exists() and not resume:
         run_stage("aib_belief.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_belief.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
@@ -554,7 +551,6 @@ def main(args: Args) -> None:
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
         buffer = rollout(envs, agent, args, seeds)
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
-        scalars["charts/episodic_return"] = scalars["train/return"]
 
         values, rewards = buffer.pop("values"), buffer["rewards"]
         if args.reward_norm:  # by the discounted sums of the rewards to come, which compute_gae gives
@@ -578,11 +574,12 @@ def main(args: Args) -> None:
                 applied.append({name: x.detach() for name, x in losses.items()})
             if stop:
                 break
-        for name in losses:  # if there was no step: of the minibatch that ended the update
-            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
+        logged = applied or [losses]  # if there was no step: the minibatch that ended the update
+        for name in losses:
+            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in logged]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
-        scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
-        scalars["charts/SPS"] = per_iteration / (time.time() - start)
+        scalars |= {"losses/explained_variance": explained.item(), "charts/episodic_return": scalars["train/return"]}
+        scalars |= {"charts/updates": len(applied), "charts/SPS": per_iteration / (time.time() - start)}
         if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
             agent.joints_norm.train()
             agent.joints_norm(batch["joints"])  # for its statistics alone
@@ -616,7 +613,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
-# the same in every script that simulates
+# identical in the four scripts that simulate
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -665,7 +662,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
-# the next three only make a CPU faster
+# the next three make a CPU faster, at the cost of slightly different pictures
 
 
 @contextmanager
@@ -673,7 +670,8 @@ def shaders_without_brdf_table() -> Iterator[None]:
     """Start SAPIEN without its table for reflections of a sky, most of the start on a CPU: these tasks have no sky."""
     set_shader_dir = sapien.render.set_camera_shader_dir
     with tempfile.TemporaryDirectory() as folder:
-        pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
+        pack = f"{folder}/minimal"
+        shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", folder, dirs_exist_ok=True)
         for file in Path(pack).glob("*.frag"):
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
@@ -787,7 +785,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
-# what a script has of these is the same in all
+# identical in all scripts that have them
 
 
 def fail(message: str) -> NoReturn:

@@ -189,7 +189,7 @@ class Agent(nn.Module):
         spaces = envs.single_observation_space
         (action_dim,) = envs.single_action_space.shape
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # a running standardiser: mean of all iterations' means and variances; without updates it changes nothing
+        # a running standardiser: mean of all iterations' means and variances; before the first it changes nothing
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
@@ -396,7 +396,6 @@ def main(args: Args) -> None:
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
         buffer = rollout(envs, agent, args, seeds)
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
-        scalars["charts/episodic_return"] = scalars["train/return"]
 
         values, rewards = buffer.pop("values"), buffer["rewards"]
         if args.reward_norm:  # by the discounted sums of the rewards to come, which compute_gae gives
@@ -420,11 +419,12 @@ def main(args: Args) -> None:
                 applied.append({name: x.detach() for name, x in losses.items()})
             if stop:
                 break
-        for name in losses:  # if there was no step: of the minibatch that ended the update
-            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
+        logged = applied or [losses]  # if there was no step: the minibatch that ended the update
+        for name in losses:
+            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in logged]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
-        scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
-        scalars["charts/SPS"] = per_iteration / (time.time() - start)
+        scalars |= {"losses/explained_variance": explained.item(), "charts/episodic_return": scalars["train/return"]}
+        scalars |= {"charts/updates": len(applied), "charts/SPS": per_iteration / (time.time() - start)}
         if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
             agent.joints_norm.train()
             agent.joints_norm(batch["joints"])  # for its statistics alone
@@ -458,7 +458,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
-# the same in every script that simulates
+# identical in the four scripts that simulate
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -507,7 +507,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
-# the next three only make a CPU faster
+# the next three make a CPU faster, at the cost of slightly different pictures
 
 
 @contextmanager
@@ -515,7 +515,8 @@ def shaders_without_brdf_table() -> Iterator[None]:
     """Start SAPIEN without its table for reflections of a sky, most of the start on a CPU: these tasks have no sky."""
     set_shader_dir = sapien.render.set_camera_shader_dir
     with tempfile.TemporaryDirectory() as folder:
-        pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
+        pack = f"{folder}/minimal"
+        shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", folder, dirs_exist_ok=True)
         for file in Path(pack).glob("*.frag"):
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
@@ -629,7 +630,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
-# what a script has of these is the same in all
+# identical in all scripts that have them
 
 
 def fail(message: str) -> NoReturn:

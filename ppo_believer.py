@@ -97,7 +97,7 @@ class Args:
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """random episodes of stage 1, which collects them if they are missing; a tenth is held out"""
+    """random episodes of stage 1, which collects them if they are missing; it holds a tenth out"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 2) are taken to be updates"""
     batch_episodes: int = 256
@@ -123,7 +123,7 @@ class Args:
     image_shift: int = 0
     """shift each episode's images by up to this many pixels while the belief is trained, against overfitting"""
     belief_amp: bool = BFLOAT16
-    """image network in bfloat16 while the belief is trained"""
+    """image network in bfloat16 in the training of the belief and its validation"""
     val_every: int = 50
     """updates between checkpoints, each with a validation"""
 
@@ -333,7 +333,7 @@ class Agent(nn.Module):
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # a running standardiser: mean of all iterations' means and variances; without updates it changes nothing
+        # a running standardiser: mean of all iterations' means and variances; before the first it changes nothing
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -362,13 +362,14 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int
     All frames go through the CNN at once, or, where they are more than CNN_CHUNK, in chunks with gradient
     checkpointing. bptt_steps truncates back-propagation through time.
     """
-    frames = [batch[name].flatten(0, 1).split(CNN_CHUNK) for name in ("rgb", "joints")]
-    chunks = list(zip(*frames, strict=True))
-    if len(chunks) == 1:
-        x = history.embed(*chunks[0])
+    rgb, joints = batch["rgb"].flatten(0, 1), batch["joints"].flatten(0, 1)
+    if len(rgb) <= CNN_CHUNK:
+        x = history.embed(rgb, joints)
     else:
-        recompute = torch.utils.checkpoint.checkpoint
-        x = torch.cat([recompute(history.embed, *chunk, use_reentrant=False) for chunk in chunks])
+        embedded = []
+        for chunk in zip(rgb.split(CNN_CHUNK), joints.split(CNN_CHUNK), strict=True):
+            embedded.append(torch.utils.checkpoint.checkpoint(history.embed, *chunk, use_reentrant=False))
+        x = torch.cat(embedded)
     outputs, hidden = [], None
     for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
         h, hidden = history(piece, hidden)
@@ -454,12 +455,8 @@ def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    default = Args.repr_dir  # a directory of another name is not made here
-    if args.small:
-        default = SMALL["repr_dir"]
-    if args.quick:
-        default = QUICK["repr_dir"]
-    if args.repr_dir == default and not (path / "repr.pt").exists():
+    made_here = (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"])  # a directory of another name is not
+    if args.repr_dir in made_here and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
@@ -494,7 +491,7 @@ def rollout(
     V(o_T) last; if deterministic also the privileged state, which the evaluation compares the belief with.
     The particles are kept because fresh ones would change the probability ratio of the update. Episodes are played in
     rounds of envs.num_envs scenes, at most args.num_envs on physx_cpu; all noise is drawn before the first round, so
-    that the size of a round changes results by rounding only. info: see PrivilegedInfoWrapper.
+    that the size of a round changes results by rounding only.
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
@@ -749,7 +746,6 @@ def main(args: Args) -> None:
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
         buffer = rollout(envs, agent, args, seeds)
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
-        scalars["charts/episodic_return"] = scalars["train/return"]
 
         values, rewards = buffer.pop("values"), buffer["rewards"]
         if args.reward_norm:  # by the discounted sums of the rewards to come, which compute_gae gives
@@ -773,11 +769,12 @@ def main(args: Args) -> None:
                 applied.append({name: x.detach() for name, x in losses.items()})
             if stop:
                 break
-        for name in losses:  # if there was no step: of the minibatch that ended the update
-            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in applied or [losses]]).mean().item()
+        logged = applied or [losses]  # if there was no step: the minibatch that ended the update
+        for name in losses:
+            scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in logged]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
-        scalars |= {"losses/explained_variance": explained.item(), "charts/updates": len(applied)}
-        scalars["charts/SPS"] = per_iteration / (time.time() - start)
+        scalars |= {"losses/explained_variance": explained.item(), "charts/episodic_return": scalars["train/return"]}
+        scalars |= {"charts/updates": len(applied), "charts/SPS": per_iteration / (time.time() - start)}
         if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
             agent.joints_norm.train()
             agent.joints_norm(batch["joints"])  # for its statistics alone
@@ -811,7 +808,7 @@ def main(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- simulator
-# the same in every script that simulates
+# identical in the four scripts that simulate
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
@@ -860,7 +857,7 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
-# the next three only make a CPU faster
+# the next three make a CPU faster, at the cost of slightly different pictures
 
 
 @contextmanager
@@ -868,7 +865,8 @@ def shaders_without_brdf_table() -> Iterator[None]:
     """Start SAPIEN without its table for reflections of a sky, most of the start on a CPU: these tasks have no sky."""
     set_shader_dir = sapien.render.set_camera_shader_dir
     with tempfile.TemporaryDirectory() as folder:
-        pack = shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", f"{folder}/shaders") + "/minimal"
+        pack = f"{folder}/minimal"
+        shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", folder, dirs_exist_ok=True)
         for file in Path(pack).glob("*.frag"):
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
@@ -982,7 +980,7 @@ def check_task(args: Args) -> None:
 
 
 # ---------------------------------------------------------------- files and stages
-# what a script has of these is the same in all
+# identical in all scripts that have them
 
 
 def fail(message: str) -> NoReturn:
