@@ -206,25 +206,31 @@ def agents_table(table: str, evals: list[dict], tests: list[dict]) -> str:
     return markdown(head, rows)
 
 
-def pairs_table(evals: list[dict]) -> str:
-    """AIB and Believer of one task, setting and seed at equal steps, and the mean of their differences."""
-    cells, differences = defaultdict(list), {metric: [] for metric in METRICS[:2]}
-    for task, setting in rows_of("agents") + rows_of("choices"):
-        for metric in METRICS[:2]:
-            curves = [by_seed(evals, metric, task=task, setting=setting, method=m) for m in ("AIB", "Believer")]
-            for seed in sorted(curves[0].keys() & curves[1].keys()):
-                last = min(curve[seed][0][-1] for curve in curves)
-                aib, believer = (values[steps <= last][-3:].mean() for steps, values in (c[seed] for c in curves))
-                differences[metric].append(aib - believer)
-                run = (task.removesuffix("-v0"), setting, seed, f"{last:,.0f}")
-                cells[run] += [f"{aib:.2f}", f"{believer:.2f}", f"{aib - believer:+.2f}"]
-    rows = [[*run, *values] for run, values in cells.items()]
-    total = [f"mean of {len(rows)} pairs", "", "", ""]
-    for values in differences.values():
-        low, high = bootstrap_interval(values)
-        total += ["", "", f"{np.mean(values):+.2f} [{low:+.2f}, {high:+.2f}]"]
-    head = ["task", "setting", "seed", "PPO steps", "once: AIB", "Believer", "difference"]
-    return markdown([*head, "at end: AIB", "Believer", "difference"], [*rows, total])
+def pairs_table(evals: list[dict], tests: list[dict]) -> str:
+    """success_once of AIB and Believer of one task, setting and seed at equal steps, and the mean differences."""
+    rows, differences = [], ([], [])  # of evaluations, of test episodes
+    for task, setting in rows_of("agents"):
+        curves, tested = [], []
+        for method in ("AIB", "Believer"):
+            chosen = {"task": task, "setting": setting, "method": method}
+            curves.append(by_seed(evals, "success_once", **chosen))
+            tested.append(by_seed(tests, "success_once", **chosen))
+        for seed in sorted(curves[0].keys() & curves[1].keys()):
+            last = min(curve[seed][0][-1] for curve in curves)
+            pairs = [[values[steps <= last][-3:].mean() for steps, values in (curve[seed] for curve in curves)]]
+            if all(seed in agents and agents[seed][0][-1] == last for agents in tested):
+                pairs.append([agents[seed][1][-1] for agents in tested])
+            row = [task.removesuffix("-v0"), setting, seed, f"{last:,.0f}"]
+            for found, (aib, believer) in zip(differences, pairs, strict=False):
+                found.append(aib - believer)
+                row += [f"{aib:.2f}", f"{believer:.2f}", f"{aib - believer:+.2f}"]
+            rows.append(row + [""] * (10 - len(row)))
+    total = ["mean of the differences", "", "", ""]
+    for found in differences:
+        low, high = bootstrap_interval(found)
+        total += ["", "", f"{np.mean(found):+.2f} [{low:+.2f}, {high:+.2f}]"]
+    head = ["task", "setting", "seed", "PPO steps", "evaluations: AIB", "Believer", "difference"]
+    return markdown([*head, "test: AIB", "Believer", "difference"], [*rows, total])
 
 
 def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str) -> str:
@@ -280,19 +286,19 @@ def oracle_table(evals: list[dict]) -> str:
 
 
 def shift_table(evals: list[dict], tests: list[dict]) -> str:
-    """R² of u at the last step of the agents' own episodes: first evaluation, lowest, last; on test episodes."""
+    """R² of u at the last step of the agents' own episodes: first evaluation, last; on test episodes."""
     rows = []
-    for task, setting in rows_of("agents") + rows_of("choices"):
+    for task, setting in rows_of("agents"):
         for method in METHODS.values():
             chosen = {"task": task, "method": method, "setting": setting}
             success = by_seed(evals, "success_once", **chosen)
             for seed, (steps, known) in by_seed(evals, "u_r2_at_end", **chosen).items():
                 cells = [seed, f"{steps[-1]:,.0f}"]
-                cells += [f"{value:.2f}" for value in (known[0], known.min(), known[-1])]
+                cells += [f"{known[0]:.2f}", f"{known[-1]:.2f}"]
                 tested = by_seed(tests, "u_r2_at_end", seed=seed, **chosen)
                 cells.append(f"{tested[seed][1][-1]:.2f}" if tested else "")
                 rows.append([task.removesuffix("-v0"), method, setting, *cells, f"{success[seed][1][-1]:.2f}"])
-    head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, first", "lowest", "last", "test"]
+    head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, first", "last", "test"]
     return markdown([*head, "success_once, last"], rows)
 
 
@@ -383,7 +389,7 @@ def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
     evals, tests, beliefs = read("eval.csv"), read("test.csv"), read("beliefs.csv")
     tables = {name: agents_table(name, evals, tests) for name in ("agents", "choices")}
-    tables |= {"results": results_table(evals), "pairs": pairs_table(evals), "beliefs": beliefs_table(beliefs)}
+    tables |= {"results": results_table(evals), "pairs": pairs_table(evals, tests), "beliefs": beliefs_table(beliefs)}
     tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "shift": shift_table(evals, tests)}
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
