@@ -356,8 +356,9 @@ def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    made_here = (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"])  # a directory of another name is not
-    if args.repr_dir in made_here and not (path / "repr.pt").exists():
+    settings = QUICK if args.quick else SMALL if args.small else {}
+    default = settings.get("repr_dir", Args.repr_dir)  # a directory of another name is not made here
+    if args.repr_dir == default and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}

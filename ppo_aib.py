@@ -293,7 +293,7 @@ class Agent(nn.Module):
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # a running standardiser: mean of all iterations' means and variances; before the first it changes nothing
+        # a running standardiser: mean of all iterations' means and variances; before the first nearly the identity
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -425,8 +425,9 @@ def rollout(
 def load_belief(args: Args, resume: bool) -> dict:
     """Read stage 2's belief.pt, made first where it is missing; a resumed run needs the one that it began with."""
     file = Path(args.belief.format(**vars(args)))
-    made_here = (Args.belief, SMALL["belief"], QUICK["belief"])  # a file of another name is not
-    if args.belief in made_here and not file.exists() and not resume:
+    settings = QUICK if args.quick else SMALL if args.small else {}
+    default = settings.get("belief", Args.belief)  # a file of another name is not made here
+    if args.belief == default and not file.exists() and not resume:
         run_stage("aib_belief.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_belief.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}

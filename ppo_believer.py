@@ -333,7 +333,7 @@ class Agent(nn.Module):
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # a running standardiser: mean of all iterations' means and variances; before the first it changes nothing
+        # a running standardiser: mean of all iterations' means and variances; before the first nearly the identity
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -455,8 +455,9 @@ def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
     path = Path(args.repr_dir.format(**vars(args)))
-    made_here = (Args.repr_dir, SMALL["repr_dir"], QUICK["repr_dir"])  # a directory of another name is not
-    if args.repr_dir in made_here and not (path / "repr.pt").exists():
+    settings = QUICK if args.quick else SMALL if args.small else {}
+    default = settings.get("repr_dir", Args.repr_dir)  # a directory of another name is not made here
+    if args.repr_dir == default and not (path / "repr.pt").exists():
         run_stage("aib_repr.py", args)
     hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
     task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}

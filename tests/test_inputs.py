@@ -344,6 +344,8 @@ def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.Cap
         ("aib_belief", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
         ("ppo_aib", dict(belief="nope.pt"), ["nope.pt does not exist"]),
         ("ppo_believer", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
+        ("aib_belief", dict(small=True), ["__aib_repr__1/repr.pt does not exist"]),  # --small makes aib_repr_small
+        ("ppo_aib", dict(small=True), ["__aib_belief__1/belief.pt does not exist"]),
         ("ppo_baseline", dict(env_id="ToyMemoryy-v0"), ["ToyMemoryy-v0 is no task"]),
     ],
 )
