@@ -260,9 +260,11 @@ def heads_table(beliefs: list[dict]) -> str:
             cells = []
             for metric in ("cue_from_particle", "u_r2_prior", "action_readout"):
                 cells.append(belief_cell(beliefs, task, method, setting, metric))
-            if any(cells):
-                rows.append([task.removesuffix("-v0"), setting, method, *cells])
-    head = ["task", "setting", "head", "cue from particles", "R² of u", "R² of a_t"]
+            chosen = {"task": task, "method": method, "setting": setting, "metric": "u_r2_prior"}
+            seeds = ", ".join(by_seed(beliefs, "value", **chosen))
+            if seeds:
+                rows.append([task.removesuffix("-v0"), setting, method, seeds, *cells])
+    head = ["task", "setting", "head", "seeds", "cue from particles", "R² of u", "R² of a_t"]
     return markdown(head, rows)
 
 
