@@ -273,7 +273,8 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int
             embedded.append(torch.utils.checkpoint.checkpoint(history.embed, *chunk, use_reentrant=False))
         x = torch.cat(embedded)
     outputs, hidden = [], None
-    for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
+    x = x.unflatten(0, batch["rgb"].shape[:2])
+    for piece in x.split(bptt_steps or len(x)):
         h, hidden = history(piece, hidden)
         hidden = hidden.detach()
         outputs.append(h)
@@ -330,7 +331,7 @@ class EpisodeDataset:
 
     def __init__(self, dataset: Path, u: Tensor, device: torch.device):
         arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
-        self.arrays = {name: x.to(device) for name, x in (*arrays.items(), ("u", u))}
+        self.arrays = {name: x.to(device) for name, x in (arrays | {"u": u}).items()}
         self.file, self.device, self.rgb = dataset / "rgb.npy", device, None
         rgb = np.load(self.file, mmap_mode="c")  # copy-on-write, without which torch warns
         if device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
@@ -383,19 +384,21 @@ def are_classes(y: Tensor) -> bool:
 
 
 def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
-    """Linear probe of y (N, K) from x (N, F): R2, or accuracy of classes, on x_test and y_test.
+    """Linear probe of y (N, K) from x (N, F): R2, or accuracy of classes, on x_test and y_test, mean over y's columns.
 
-    The ridge of R2 is chosen by cross-validation. What does not vary in y is left out; nan when nothing does.
+    The ridge of R2 is chosen by cross-validation. Columns that do not vary are left out; nan when none does.
     """
     varies = y.amax(0) > y.amin(0)
     if not varies.any():
         return math.nan
+    y, y_test = y[:, varies], y_test[:, varies]
     model = linear_model.RidgeCV(np.logspace(-3, 4, 8))
-    if are_classes(y[:, varies]):
+    if are_classes(y):
         model = linear_model.LogisticRegression(max_iter=1000)
-    x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y[:, varies], x_test, y_test[:, varies]))
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
-    return float(np.mean([model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]))
+    x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y, x_test, y_test))
+    scores = [model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]
+    return float(np.mean(scores))
 
 
 @torch.no_grad()
@@ -404,7 +407,7 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
 
     h (E, T+1, 256); u (E, T+1, u_dim), actions (E, T, A), cue (E, K): the episodes' own
     z_mean (E, T+1, z_dim): mean of q(z|u,h)
-    u_prior (E, T+1, u_dim): mean of 30 particles, decoded samples of p(z|h); u_posterior: z_mean decoded
+    u_prior (E, T+1, u_dim): mean particle, of 30 means of p(u|z,h) with z ~ p(z|h); u_posterior: z_mean decoded
     nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: low also where the
     samples lie at several possible places, one of them u's; nll_posterior (E, T+1): -log p(u|z,h) with z ~ q(z|u,h)
     """
@@ -482,9 +485,9 @@ def main(args: Args) -> None:
         return
     episodes, stored = load_episodes(args)
     open_run(path, args)
-    # of the held-out episodes, linear probes are fitted on one half and tested on the other
-    num_val = stored["num_val"]
-    train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-num_val, -(num_val // 2)])
+    inds, num_val = np.arange(args.num_episodes), stored["num_val"]
+    train, test_on = inds[:-num_val], inds[-(num_val // 2) :]
+    fit_on = inds[-num_val : -(num_val // 2)]  # linear probes are fitted on these and tested on test_on
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {

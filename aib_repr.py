@@ -275,11 +275,9 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     rgb (N, T+1, H, W, 3) uint8; joints, state (N, T+1, .); actions (N, T, A); rewards, success (N, T); cue, the memory
     variable (N, K).
     """
-    meta = {"format": FORMAT, **asdict(args), "episodes_done": 0}
+    meta, arrays = {"format": FORMAT, **asdict(args), "episodes_done": 0}, {}
     if (path / "meta.json").exists():
         meta = json.loads((path / "meta.json").read_text())
-    arrays = {}
-    if meta["episodes_done"]:
         arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy")}
     if meta["episodes_done"] == args.num_episodes:
         return arrays
@@ -362,7 +360,7 @@ def main(args: Args) -> None:
             if found.get(name) != needed[name]:
                 fail(f"{path} has {name} {found.get(name)}, this run needs {needed[name]}; --overwrite deletes it")
     else:
-        size = args.num_episodes * gym.spec(args.env_id).max_episode_steps * args.image_size**2 * 3
+        size = args.num_episodes * (gym.spec(args.env_id).max_episode_steps + 1) * args.image_size**2 * 3
         if size > shutil.disk_usage("runs" if Path("runs").exists() else ".").free:
             fail(f"the pictures take {size / 1e9:.1f} GB, more than the disk has free; lower --num-episodes")
     open_run(path, args)
@@ -390,20 +388,20 @@ def main(args: Args) -> None:
     model = nn.ModuleDict({"phi": phi, "psi": psi, "g": g}).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     train_inds, val_inds = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
-    per_epoch, completed = math.ceil(len(train_inds) / args.batch_size), 0
+    updates_per_epoch, completed = math.ceil(len(train_inds) / args.batch_size), 0
     if (path / "checkpoint.pt").exists():
         checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         completed = checkpoint["epoch"]
         print(f"resuming {path} at epoch {completed}", flush=True)
-    writer = SummaryWriter(path, purge_step=completed * per_epoch + 1)
-    bar = tqdm(total=args.epochs * per_epoch, initial=completed * per_epoch, desc="phi", unit="update")
+    writer = SummaryWriter(path, purge_step=completed * updates_per_epoch + 1)
+    bar = tqdm(total=args.epochs * updates_per_epoch, initial=completed * updates_per_epoch, desc="phi", unit="update")
 
     for epoch in range(completed, args.epochs):
         torch.manual_seed(args.seed * 1_000_000 + epoch)  # so that a resumed run repeats the epoch
         order = np.random.default_rng([args.seed, epoch]).permutation(train_inds)
-        for index in np.array_split(order, per_epoch):
+        for index in np.array_split(order, updates_per_epoch):
             losses = repr_losses(model, transitions(index), args)
             optimizer.zero_grad()
             losses["total"].backward()
@@ -417,7 +415,7 @@ def main(args: Args) -> None:
             val_losses = repr_losses(model, val_batch, args)
             active = (phi(val_batch["state"]).mean.std(0) > 0.1).sum()
         bar.set_postfix(held_out_reward=f"{val_losses['reward']:.2f}")
-        update = (epoch + 1) * per_epoch
+        update = (epoch + 1) * updates_per_epoch
         writer.add_scalar("held_out/active_dimensions", active, update)  # of u; the others have collapsed
         for name, loss in losses.items():
             writer.add_scalar(f"losses/{name}", loss, update)

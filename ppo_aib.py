@@ -293,7 +293,7 @@ class Agent(nn.Module):
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # a running standardiser: mean of all iterations' means and variances; before the first nearly the identity
+        # standardises by the mean of all iterations' means and variances; nearly the identity before the first
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -405,7 +405,7 @@ def rollout(
             if t == steps:
                 break  # the last observation is only for its value
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            # of each step alone, although coloured noise is correlated; of the action before clamping
+            # of the action before clamping; as if steps were independent, although coloured noise is correlated
             step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
             if deterministic:
                 step["state"] = torch.as_tensor(info["state"], dtype=torch.float32, device=device)
@@ -505,10 +505,10 @@ def evaluate_checkpoint(args: Args) -> None:
 def main(args: Args) -> None:
     """Train an agent that acts on observation and belief."""
     check_task(args)
-    per_iteration = gym.spec(args.env_id).max_episode_steps * args.num_envs
-    num_iterations = max(1, args.total_timesteps // per_iteration)
-    if args.num_minibatches > per_iteration:
-        fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
+    batch_size = gym.spec(args.env_id).max_episode_steps * args.num_envs
+    num_iterations = max(1, args.total_timesteps // batch_size)
+    if args.num_minibatches > batch_size:
+        fail(f"--num-minibatches {args.num_minibatches} must be at most the {batch_size} steps of an iteration")
     if args.total_timesteps > 1_000_000 and not CUDA:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes half an hour", flush=True)
     path = check_run(args)
@@ -517,8 +517,8 @@ def main(args: Args) -> None:
     if checkpoint.get("iteration", 0) >= num_iterations:
         print(f"{path} is finished; --overwrite recreates it, a larger --total-timesteps continues it")
         return
-    stored = load_belief(args, bool(checkpoint))
-    if checkpoint:
+    stored = load_belief(args, resume)
+    if resume:
         for name, x in stored["belief"].items():
             old = checkpoint["agent"].get(f"belief.{name}")
             if old is None or not torch.equal(old, x):
@@ -538,13 +538,13 @@ def main(args: Args) -> None:
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        print(f"resuming {path} at step {completed * per_iteration:,}", flush=True)
-    writer = SummaryWriter(path, purge_step=completed * per_iteration + 1)
-    bar = tqdm(total=num_iterations * per_iteration, initial=completed * per_iteration, desc="PPO", unit="step")
+        print(f"resuming {path} at step {completed * batch_size:,}", flush=True)
+    writer = SummaryWriter(path, purge_step=completed * batch_size + 1)
+    bar = tqdm(total=num_iterations * batch_size, initial=completed * batch_size, desc="PPO", unit="step")
 
     for iteration in range(completed + 1, num_iterations + 1):
         start = time.time()
-        global_step = iteration * per_iteration  # after this iteration
+        global_step = iteration * batch_size  # after this iteration
         if args.final_std is not None:
             std = args.init_std + (args.final_std - args.init_std) * iteration / num_iterations
             agent.log_std.requires_grad_(False).fill_(math.log(std))
@@ -563,7 +563,7 @@ def main(args: Args) -> None:
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
         applied = []  # losses of the minibatches that led to an optimizer step
         for _ in range(args.update_epochs):
-            for mb_inds in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
+            for mb_inds in torch.randperm(batch_size, device=device).tensor_split(args.num_minibatches):
                 losses = ppo_losses(agent, {name: x[mb_inds] for name, x in batch.items()}, args)
                 stop = losses["approx_kl"] > args.target_kl
                 if stop:
@@ -580,12 +580,12 @@ def main(args: Args) -> None:
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in logged]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/episodic_return": scalars["train/return"]}
-        scalars |= {"charts/updates": len(applied), "charts/SPS": per_iteration / (time.time() - start)}
+        scalars |= {"charts/updates": len(applied), "charts/SPS": batch_size / (time.time() - start)}
         if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
             agent.joints_norm.train()
             agent.joints_norm(batch["joints"])  # for its statistics alone
             agent.joints_norm.eval()
-        del buffer, batch, losses  # a gigabyte of images, before the evaluation has its own
+        del buffer, batch, losses, logged  # a gigabyte of images, before the evaluation has its own
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
             metrics, video = evaluate(envs, agent, args)
@@ -605,7 +605,7 @@ def main(args: Args) -> None:
         writer.flush()
         states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "reward_var": reward_var}
         save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": evals, **states})
-        bar.update(per_iteration)
+        bar.update(batch_size)
     bar.close()
     envs.close()
     for name in ("success_once", "success_at_end", "return"):

@@ -333,7 +333,7 @@ class Agent(nn.Module):
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # a running standardiser: mean of all iterations' means and variances; before the first nearly the identity
+        # standardises by the mean of all iterations' means and variances; nearly the identity before the first
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -371,7 +371,8 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int
             embedded.append(torch.utils.checkpoint.checkpoint(history.embed, *chunk, use_reentrant=False))
         x = torch.cat(embedded)
     outputs, hidden = [], None
-    for piece in x.unflatten(0, batch["rgb"].shape[:2]).split(bptt_steps or len(batch["rgb"])):
+    x = x.unflatten(0, batch["rgb"].shape[:2])
+    for piece in x.split(bptt_steps or len(x)):
         h, hidden = history(piece, hidden)
         hidden = hidden.detach()
         outputs.append(h)
@@ -429,7 +430,7 @@ class EpisodeDataset:
 
     def __init__(self, dataset: Path, u: Tensor, device: torch.device):
         arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
-        self.arrays = {name: x.to(device) for name, x in (*arrays.items(), ("u", u))}
+        self.arrays = {name: x.to(device) for name, x in (arrays | {"u": u}).items()}
         self.file, self.device, self.rgb = dataset / "rgb.npy", device, None
         rgb = np.load(self.file, mmap_mode="c")  # copy-on-write, without which torch warns
         if device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
@@ -526,7 +527,7 @@ def rollout(
             if t == steps:
                 break  # the last observation is only for its value
             step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            # of each step alone, although coloured noise is correlated; of the action before clamping
+            # of the action before clamping; as if steps were independent, although coloured noise is correlated
             step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
             if deterministic:
                 step["state"] = torch.as_tensor(info["state"], dtype=torch.float32, device=device)
@@ -548,7 +549,7 @@ def rollout(
 
 @torch.no_grad()
 def validate_belief(belief: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> tuple[Tensor, Tensor]:
-    """u and mean particle, both (T+1, E, u_dim), of episodes index (E,) that the belief is not trained on."""
+    """u and mean particle, of 30 means of p(u|z,h), both (T+1, E, u_dim), of episodes index (E,)."""
     torch.manual_seed(0)  # the same noise every time, so that errors compare
     num_particles = 30
     u, estimate = [], []
@@ -612,11 +613,16 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
     """Train Believer's belief on stage 1's output as aib_belief.py does; writes belief.pt into path."""
     device = torch.device(args.device)
     inds, num_val = np.arange(args.num_episodes), stored["num_val"]
-    train, test_on = inds[:-num_val], inds[-(num_val // 2) :]  # aib_belief.py fits its probes on those between
+    train, test_on = inds[:-num_val], inds[-(num_val // 2) :]
     sample = episodes(train[:1])
-    config = {"image_shape": list(sample["rgb"].shape[2:]), "gru_layers": args.gru_layers, "z_dim": args.z_dim}
-    config["joints_dim"] = sample["joints"].shape[-1] if args.history_joints else 0
-    config |= {"state_dim": len(stored["phi"]["mean"]), "u_dim": stored["u_dim"]}
+    config = {
+        "image_shape": list(sample["rgb"].shape[2:]),
+        "joints_dim": sample["joints"].shape[-1] if args.history_joints else 0,
+        "state_dim": len(stored["phi"]["mean"]),
+        "gru_layers": args.gru_layers,
+        "u_dim": stored["u_dim"],
+        "z_dim": args.z_dim,
+    }
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": BelieverBelief(config, args.belief_amp)})
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
@@ -669,7 +675,7 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "belief_checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
 
-    # the last weights are kept: held-out error and likelihood are best early, when the belief does not yet remember
+    # no early stopping: held-out error is best before h holds the cue
     writer.close()
     content = {"kind": "believer_belief", "config": config, "belief": model["belief"].state_dict()}
     save(path / "belief.pt", content)
@@ -699,10 +705,10 @@ def evaluate_checkpoint(args: Args) -> None:
 def main(args: Args) -> None:
     """Train belief and agent of the Believer baseline."""
     check_task(args)
-    per_iteration = gym.spec(args.env_id).max_episode_steps * args.num_envs
-    num_iterations = max(1, args.total_timesteps // per_iteration)
-    if args.num_minibatches > per_iteration:
-        fail(f"--num-minibatches {args.num_minibatches} must be at most the {per_iteration} steps of an iteration")
+    batch_size = gym.spec(args.env_id).max_episode_steps * args.num_envs
+    num_iterations = max(1, args.total_timesteps // batch_size)
+    if args.num_minibatches > batch_size:
+        fail(f"--num-minibatches {args.num_minibatches} must be at most the {batch_size} steps of an iteration")
     if args.total_timesteps > 1_000_000 and not CUDA:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes half an hour", flush=True)
     path = check_run(args)
@@ -733,13 +739,13 @@ def main(args: Args) -> None:
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
         optimizer.load_state_dict(checkpoint["optimizer"])
-        print(f"resuming {path} at step {completed * per_iteration:,}", flush=True)
-    writer = SummaryWriter(path, purge_step=completed * per_iteration + 1)
-    bar = tqdm(total=num_iterations * per_iteration, initial=completed * per_iteration, desc="PPO", unit="step")
+        print(f"resuming {path} at step {completed * batch_size:,}", flush=True)
+    writer = SummaryWriter(path, purge_step=completed * batch_size + 1)
+    bar = tqdm(total=num_iterations * batch_size, initial=completed * batch_size, desc="PPO", unit="step")
 
     for iteration in range(completed + 1, num_iterations + 1):
         start = time.time()
-        global_step = iteration * per_iteration  # after this iteration
+        global_step = iteration * batch_size  # after this iteration
         if args.final_std is not None:
             std = args.init_std + (args.final_std - args.init_std) * iteration / num_iterations
             agent.log_std.requires_grad_(False).fill_(math.log(std))
@@ -758,7 +764,7 @@ def main(args: Args) -> None:
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
         applied = []  # losses of the minibatches that led to an optimizer step
         for _ in range(args.update_epochs):
-            for mb_inds in torch.randperm(per_iteration, device=device).tensor_split(args.num_minibatches):
+            for mb_inds in torch.randperm(batch_size, device=device).tensor_split(args.num_minibatches):
                 losses = ppo_losses(agent, {name: x[mb_inds] for name, x in batch.items()}, args)
                 stop = losses["approx_kl"] > args.target_kl
                 if stop:
@@ -775,12 +781,12 @@ def main(args: Args) -> None:
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in logged]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/episodic_return": scalars["train/return"]}
-        scalars |= {"charts/updates": len(applied), "charts/SPS": per_iteration / (time.time() - start)}
+        scalars |= {"charts/updates": len(applied), "charts/SPS": batch_size / (time.time() - start)}
         if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
             agent.joints_norm.train()
             agent.joints_norm(batch["joints"])  # for its statistics alone
             agent.joints_norm.eval()
-        del buffer, batch, losses  # a gigabyte of images, before the evaluation has its own
+        del buffer, batch, losses, logged  # a gigabyte of images, before the evaluation has its own
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
             metrics, video = evaluate(envs, agent, args)
@@ -800,7 +806,7 @@ def main(args: Args) -> None:
         writer.flush()
         states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "reward_var": reward_var}
         save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": evals, **states})
-        bar.update(per_iteration)
+        bar.update(batch_size)
     bar.close()
     envs.close()
     for name in ("success_once", "success_at_end", "return"):

@@ -308,15 +308,14 @@ def shift_table(evals: list[dict], tests: list[dict]) -> str:
 
 
 def draw(axes: plt.Axes, curves: dict[str, tuple[np.ndarray, np.ndarray]], label: str, colour: str | None) -> None:
-    """Mean over seeds at the steps all of them have, shaded by the standard deviation."""
+    """Mean over seeds at the steps all of them have, and each seed as a thin line."""
     if not curves:
         return
     steps = sorted(set.intersection(*(set(steps) for steps, _ in curves.values())))
     values = np.stack([values[np.isin(seed_steps, steps)] for seed_steps, values in curves.values()])
     (line,) = axes.plot(steps, values.mean(0), color=colour, label=label)
     if len(curves) > 1:
-        spread = values.std(0, ddof=1)
-        axes.fill_between(steps, values.mean(0) - spread, values.mean(0) + spread, color=line.get_color(), alpha=0.2)
+        axes.plot(steps, values.T, color=line.get_color(), linewidth=0.8, alpha=0.4)
 
 
 def save_figure(figure: plt.Figure, axes: np.ndarray, path: Path) -> None:
@@ -343,7 +342,7 @@ def learning_curves(evals: list[dict], path: Path) -> None:
         for method in METHODS.values():
             curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
             draw(ax, curves, method, COLOURS[method])
-            seeds.append(f"{method} {len(curves)}")
+            seeds.append(f"{len(curves)} {method}")
         if setting == "small":
             ((steps, values),) = by_seed(evals, "success_once", task=task, method="AIB", setting=WHITE_SETTING).values()
             shown = steps <= 120_000
@@ -352,7 +351,7 @@ def learning_curves(evals: list[dict], path: Path) -> None:
         if task in CHANCE:
             ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
         ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}")
-        ax.set(xlabel="PPO steps", ylim=(0, 1.02))
+        ax.set(xlabel="PPO steps", ylim=(-0.03, 1.03))  # curves at 0 beside the axis
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 100k
     axes[0].set_ylabel("success_once")
     save_figure(figure, axes, path)
@@ -363,15 +362,15 @@ def belief_figure(beliefs: list[dict], path: Path) -> None:
     columns = [("RememberColor3-v0", "128 px, 640 episodes, 600 updates, kl_coef 0.01, no gradient clipping")]
     columns += [("RememberShapeAndColor3x2-v0", HEAD_SETTING), ("InterceptFast-v0", HEAD_SETTING)]
     figure, axes = plt.subplots(2, 3, figsize=(12, 5.5), layout="constrained", sharex="col")
-    metrics = {"cue_from_particle": "cue", "u_r2_prior": "R² of u"}
     for (task, setting), column in zip(columns, axes.T, strict=True):
+        chance = next(iter(by_seed(beliefs, "value", task=task, setting=setting, metric="cue_chance").values()))[1][0]
+        metrics = {"cue_from_particle": "accuracy of the cue" if chance else "R² of the cue", "u_r2_prior": "R² of u"}
         for ax, (metric, label) in zip(column, metrics.items(), strict=True):
             for method in HEADS.values():
                 curves = by_seed(beliefs, "value", task=task, method=method, setting=setting, metric=metric)
                 draw(ax, curves, method, COLOURS[method])
             ax.set(ylabel=label, ylim=(-0.3, 1.05))
-        chance = by_seed(beliefs, "value", task=task, setting=setting, metric="cue_chance")
-        column[0].axhline(next(iter(chance.values()))[1][0], color="grey", linestyle=":", label="chance")
+        column[0].axhline(chance, color="grey", linestyle=":", label="chance")
         column[0].set_title(task.removesuffix("-v0"))
         column[1].set_xlabel("time step")
     save_figure(figure, axes, path)
