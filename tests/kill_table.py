@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -56,10 +57,17 @@ KILLS = [  # script, what it was doing, the moment
 ]
 
 
-def start(script: str, folder: Path, moment: str | None = None) -> int:
+@cache
+def server() -> subprocess.Popen:
+    """The process that starts processes; it ends with the tests."""
+    pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    return subprocess.Popen([sys.executable, str(ROOT / "tests" / "toy_run.py")], **pipes)
+
+
+def start(script: str, folder: Path, moment: str = "") -> int:
     """Run a script on the toy task in folder, to be killed at a moment; the exit code."""
-    command = [sys.executable, str(ROOT / "tests" / "toy_run.py"), script, json.dumps(SIZES[script])]
-    return subprocess.run(command + ([moment] if moment else []), cwd=folder, capture_output=True).returncode
+    print(json.dumps([str(folder), script, SIZES[script], moment]), file=server().stdin, flush=True)
+    return int(server().stdout.readline())
 
 
 def results(folder: Path) -> dict[str, object]:

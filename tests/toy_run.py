@@ -1,7 +1,9 @@
-"""Run one script's main on the toy task in a process of its own, and kill it outright at a chosen moment.
+"""Run scripts' mains on the toy task, each in a process of its own, and kill it outright at a chosen moment.
 
-python tests/toy_run.py SCRIPT 'JSON of arguments' [MOMENT:COUNT]: at the COUNT-th call of MOMENT (a function of the
-script, os.replace, torch.save or env.step) the process gets SIGKILL, as from a scheduler that has lost patience.
+python tests/toy_run.py reads lines [folder, script, arguments, "MOMENT:COUNT" or ""] as JSON and answers each with an
+exit code. At the COUNT-th call of MOMENT (a function of the script, os.replace, torch.save or env.step) the process
+gets SIGKILL, as from a scheduler that has lost patience. The processes are forked from this one, as imports take longer
+than they do.
 """
 
 import importlib
@@ -32,17 +34,31 @@ def deadly(function: Callable, count: int) -> Callable:
     return wrapped
 
 
-def main() -> None:
-    """See the module's docstring."""
-    script, arguments = sys.argv[1], json.loads(sys.argv[2])
+def play(script: str, arguments: dict, moment: str) -> None:
+    """Run a script's main on the toy task; with a moment, up to it."""
     module = importlib.import_module(script)
     toy.take_the_simulators_place(setattr, module)
-    if len(sys.argv) > 3:
-        moment, count = sys.argv[3].split(":")
-        owner = {"os": os, "torch": torch, "env": toy.ToyMemory}.get(moment.split(".")[0], module)
-        name = moment.split(".")[-1]
+    if moment:
+        path, count = moment.split(":")
+        owner = {"os": os, "torch": torch, "env": toy.ToyMemory}.get(path.split(".")[0], module)
+        name = path.split(".")[-1]
         setattr(owner, name, deadly(getattr(owner, name), int(count)))
     module.main(module.Args(env_id="ToyMemory-v0", **arguments))
+
+
+def main() -> None:
+    """See the module's docstring."""
+    for name in ("torch._dynamo", "aib_repr", "aib_belief", "ppo_aib", "ppo_believer", "ppo_baseline"):
+        importlib.import_module(name)  # torch.optim would import torch._dynamo
+    for line in sys.stdin:
+        folder, *order = json.loads(line)
+        process = os.fork()
+        if not process:
+            os.chdir(folder)
+            os.dup2(os.open(os.devnull, os.O_RDWR), sys.stdout.fileno())
+            play(*order)
+            return
+        print(os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), flush=True)
 
 
 if __name__ == "__main__":
