@@ -42,7 +42,9 @@ from tqdm import tqdm
 FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CNN_CHUNK = 2048  # images through a belief's CNN at a time; their activations take 1 to 2 GB
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
+BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
+if CUDA:
+    BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -79,7 +81,7 @@ class Args:
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """random episodes of stage 1, which collects them if they are missing; it holds a tenth out"""
+    """random episodes of stage 1, made if they are missing, else the number that its dataset has"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 3) are taken to be updates"""
     batch_episodes: int = 256
@@ -128,6 +130,7 @@ QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 
 
 # ---------------------------------------------------------------- networks
+# HistoryEncoder and AIBBelief are the same in aib_belief.py and ppo_aib.py, which loads the former's weights
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:
@@ -220,7 +223,10 @@ class HistoryEncoder(nn.Module):
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
     def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """x (T, B, .) of T steps that follow the GRU's state hidden (None: start) -> h (T, B, 256), hidden."""
+        """x (T, B, .), the T steps after those in hidden (None: none) -> h (T, B, 256), new hidden (one tensor).
+
+        Training passes whole episodes, rollout one step at a time.
+        """
         output, hidden = self.gru(x, hidden)
         return self.out(torch.cat([output, x], -1)), hidden
 
@@ -408,9 +414,10 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
     h (E, T+1, 256); u (E, T+1, u_dim), actions (E, T, A), cue (E, K): the episodes' own
     z_mean (E, T+1, z_dim): mean of q(z|u,h)
     u_prior (E, T+1, u_dim): mean particle, of 30 means of p(u|z,h) with z ~ p(z|h); u_posterior: z_mean decoded
-    nll_prior (E, T+1): -log p(u|h), where p(u|h) is the mean of p(u|z,h) over those 30 samples: low also where the
-    samples lie at several possible places, one of them u's; nll_posterior (E, T+1): -log p(u|z,h) with z ~ q(z|u,h)
+    nll_prior (E, T+1): -log of the mean of p(u|z,h) over those 30 samples: low as soon as some samples are near u, even
+    if others lie elsewhere; nll_posterior (E, T+1): -log p(u|z,h) with z ~ q(z|u,h)
     """
+    belief.eval()
     torch.manual_seed(0)  # the same noise every time, so that errors compare
     num_particles = 30
     parts = []
@@ -428,6 +435,7 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
         part = {name: x.transpose(0, 1) for name, x in part.items()}
         part["cue"] = batch["cue"]
         parts.append(part)
+    belief.train()
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -435,8 +443,9 @@ def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
     """What the belief knows of the episodes test (encode's); linear probes are fitted on the episodes fit.
 
     By time step: u_r2_prior, u_r2_posterior, R2 of u from the mean particle and from z_mean decoded; cue_from_h,
-    cue_from_particle, cue_from_u, probes of the memory variable. Single numbers: nll_prior, nll_posterior, means;
-    action_readout, probe of a_t from z_mean at t and t + 1; cue_chance, accuracy of guessing (0 for R2).
+    cue_from_particle (the mean one), cue_from_u, probes of the memory variable. Single numbers: nll_prior,
+    nll_posterior, means; action_readout, probe of a_t from z_mean at t and t + 1; cue_chance, accuracy of guessing (0
+    for R2).
     """
     report = {name: test[name].mean().item() for name in ("nll_prior", "nll_posterior")}
     total = (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)
@@ -694,4 +703,4 @@ if __name__ == "__main__":
     try:
         main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")
+        sys.exit("\nstopped; training resumes from its last checkpoint with the same command, without --overwrite")

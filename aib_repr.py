@@ -47,7 +47,9 @@ from tqdm import tqdm
 
 FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
+BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
+if CUDA:
+    BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -706,4 +708,4 @@ if __name__ == "__main__":
     try:
         main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")
+        sys.exit("\nstopped; training resumes from its last checkpoint with the same command, without --overwrite")

@@ -55,7 +55,9 @@ from tqdm import tqdm
 
 FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
+BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
+if CUDA:
+    BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
 EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; PPO trains on those below 2**30, stage 1 has those between
 TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, never used for training or tuning
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -94,7 +96,7 @@ class Args:
     belief: str = "runs/{env_id}__aib_belief__{seed}/belief.pt"
     """belief of stage 2"""
     num_episodes: int = 2000
-    """random episodes of stage 1, which holds a tenth out; handed to the earlier stages where they run first"""
+    """random episodes of stage 1, made if they are missing, else the number that the belief was trained with"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
     sample_decoder: bool = True
@@ -142,7 +144,7 @@ class Args:
     amp: bool = False
     """image networks of policy and belief in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint; task, image_size, num_envs, amp and the like are those stored in it"""
+    """only evaluate --checkpoint; task, networks, image_size, robot_triangles and num_envs are those stored in it"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
@@ -166,6 +168,7 @@ QUICK |= dict(num_episodes=8, belief="runs/{env_id}__aib_belief_quick__{seed}/be
 
 
 # ---------------------------------------------------------------- networks
+# HistoryEncoder and AIBBelief are the same in aib_belief.py and ppo_aib.py, which loads the former's weights
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:
@@ -258,7 +261,10 @@ class HistoryEncoder(nn.Module):
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
     def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """x (T, B, .) of T steps that follow the GRU's state hidden (None: start) -> h (T, B, 256), hidden."""
+        """x (T, B, .), the T steps after those in hidden (None: none) -> h (T, B, 256), new hidden (one tensor).
+
+        Training passes whole episodes, rollout one step at a time.
+        """
         output, hidden = self.gru(x, hidden)
         return self.out(torch.cat([output, x], -1)), hidden
 
@@ -291,9 +297,9 @@ class Agent(nn.Module):
         super().__init__()
         spaces = envs.single_observation_space
         (action_dim,) = envs.single_action_space.shape
-        self.belief = belief.requires_grad_(False)  # frozen; W_enc and W_agg learn with actor and critic
+        self.belief = belief.requires_grad_(False).eval()  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # standardises by the mean of all iterations' means and variances; nearly the identity before the first
+        # standardises by the iterations' mean means and variances; without --joints-norm (nearly) the identity
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
@@ -370,8 +376,8 @@ def rollout(
     Returns tensors (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; and values (T+1, N),
     V(o_T) last; if deterministic also the privileged state, which the evaluation compares the belief with.
     The particles are kept because fresh ones would change the probability ratio of the update. Episodes are played in
-    rounds of envs.num_envs scenes, at most args.num_envs on physx_cpu; all noise is drawn before the first round, so
-    that the size of a round changes results by rounding only.
+    rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the size of a round changes
+    results by rounding only.
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
@@ -414,8 +420,7 @@ def rollout(
             step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
             for name, value in step.items():
                 if name not in buffer:
-                    buffer_shape = (steps, num_episodes, *value.shape[1:])
-                    buffer[name] = torch.empty(buffer_shape, dtype=value.dtype, device=device)
+                    buffer[name] = value.new_empty(steps, num_episodes, *value.shape[1:])
                 buffer[name][t, kept] = value[: len(kept)]
             bar.update()
     bar.close()
@@ -530,7 +535,7 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     agent = Agent(envs, AIBBelief(stored["config"], args.amp), args).to(device)
     agent.belief.load_state_dict(stored["belief"])
-    others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]
+    others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]  # the belief's stay as they are
     cnn = {"params": agent.cnn.parameters(), "lr": args.cnn_lr_scale * args.learning_rate}
     optimizer = torch.optim.Adam([cnn, {"params": others}], lr=args.learning_rate, eps=1e-5, fused=True)
     completed, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
@@ -554,7 +559,7 @@ def main(args: Args) -> None:
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
 
         values, rewards = buffer.pop("values"), buffer["rewards"]
-        if args.reward_norm:  # by the discounted sums of the rewards to come, which compute_gae gives
+        if args.reward_norm:  # with values 0 and lambda 1 compute_gae gives the discounted sums of the rewards to come
             sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
             reward_var += (sums.var().item() - reward_var) / iteration  # mean over iterations
             rewards = rewards / (reward_var + 1e-8) ** 0.5
@@ -914,4 +919,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")
+        sys.exit("\nstopped; training resumes from its last checkpoint with the same command, without --overwrite")

@@ -46,7 +46,9 @@ from tqdm import tqdm
 
 FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
-BFLOAT16 = torch.cuda.is_bf16_supported(False) if CUDA else "bf16" in Path("/proc/cpuinfo").read_text()  # not emulated
+BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
+if CUDA:
+    BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
 EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; PPO trains on those below 2**30, stage 1 has those between
 TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, never used for training or tuning
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -125,7 +127,7 @@ class Args:
     amp: bool = False
     """image network in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint; task, image_size, num_envs, amp and the like are those stored in it"""
+    """only evaluate --checkpoint; task, networks, image_size, robot_triangles and num_envs are those stored in it"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
@@ -189,7 +191,7 @@ class Agent(nn.Module):
         spaces = envs.single_observation_space
         (action_dim,) = envs.single_action_space.shape
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # standardises by the mean of all iterations' means and variances; nearly the identity before the first
+        # standardises by the iterations' mean means and variances; without --joints-norm (nearly) the identity
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
@@ -198,7 +200,7 @@ class Agent(nn.Module):
         self.log_std = nn.Parameter(torch.full((action_dim,), math.log(args.init_std)))
 
     def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
-        """Distribution of actions (B, A), value (B,): rgb (B, H, W, 3) uint8 and joints (B, J)."""
+        """rgb (B, H, W, 3) uint8, joints (B, J) -> Normal over actions (B, A), value (B,)."""
         image = self.cnn(obs["rgb"].float().div_(255))
         joints = self.joints(self.joints_norm(obs["joints"]))
         x = torch.cat([image, joints], -1)
@@ -261,8 +263,8 @@ def rollout(
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
     Returns tensors (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; and values (T+1, N), V(o_T)
-    last. Episodes are played in rounds of envs.num_envs; all noise is drawn before, so that on physx_cpu the size of a
-    round does not matter.
+    last. Episodes are played in rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the
+    size of a round changes results by rounding only.
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
@@ -293,8 +295,7 @@ def rollout(
             step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
             for name, value in step.items():
                 if name not in buffer:
-                    buffer_shape = (steps, num_episodes, *value.shape[1:])
-                    buffer[name] = torch.empty(buffer_shape, dtype=value.dtype, device=device)
+                    buffer[name] = value.new_empty(steps, num_episodes, *value.shape[1:])
                 buffer[name][t, kept] = value[: len(kept)]
             bar.update()
     bar.close()
@@ -398,7 +399,7 @@ def main(args: Args) -> None:
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
 
         values, rewards = buffer.pop("values"), buffer["rewards"]
-        if args.reward_norm:  # by the discounted sums of the rewards to come, which compute_gae gives
+        if args.reward_norm:  # with values 0 and lambda 1 compute_gae gives the discounted sums of the rewards to come
             sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
             reward_var += (sums.var().item() - reward_var) / iteration  # mean over iterations
             rewards = rewards / (reward_var + 1e-8) ** 0.5
@@ -737,4 +738,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from its last checkpoint")
+        sys.exit("\nstopped; training resumes from its last checkpoint with the same command, without --overwrite")
