@@ -1,10 +1,17 @@
 """The examples of a user's own task run as a user would run them, and their pictures hide what must be remembered."""
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
+import pytest
 
-from conftest import run
+from conftest import ROOT, run
+
+sys.path.append(str(ROOT / "docs" / "examples"))
+from gymnasium_task import RememberTarget, check_envs
 
 
 def target_pixels(rgb: np.ndarray) -> np.ndarray:
@@ -44,3 +51,58 @@ def test_maniskill_task_shows_its_disc_at_first_and_not_later(tmp_path: Path) ->
     assert seen[:, :5].min() > 100 and seen[:, 5:].max() < 10
     assert (episodes["state"][:, :, :2] == episodes["cue"][:, None]).all(), "the hidden disc stays where it was"
     assert np.ptp(episodes["rewards"].mean(1)) > 0.05, "random actions are rewarded differently for different discs"
+
+
+MISTAKES = {  # what a task returns, changed: what check_envs says of it
+    "no cue at step 3": lambda env, obs, info: info.pop("cue") if env.t == 3 else None,
+    "success must be numbers": lambda env, obs, info: info.update(success=np.bool_(True)),
+    "state is not finite at step 2": lambda env, obs, info: info.update(state=info["state"] / (env.t != 2)),
+    "seed": lambda env, obs, info: info.update(state=np.random.default_rng().normal(size=4)),
+}
+
+
+@pytest.mark.parametrize(("message", "spoil"), MISTAKES.items())
+def test_a_task_that_breaks_the_contract_is_told_how(message: str, spoil: Callable) -> None:
+    class Broken(RememberTarget):
+        def observe(self) -> tuple[dict, dict]:
+            obs, info = super().observe()
+            spoil(self, obs, info)
+            return obs, info
+
+    with np.errstate(divide="ignore", invalid="ignore"), pytest.raises(AssertionError, match=message):
+        check_task_class(Broken)
+
+
+def test_an_episode_that_ends_early_is_told_when() -> None:
+    class Broken(RememberTarget):
+        def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
+            obs, reward, _, _, info = super().step(action)
+            return obs, reward, self.t == 7, False, info
+
+    check_task_class(RememberTarget)
+    with pytest.raises(AssertionError, match="ended at step 7 of 20"):
+        check_task_class(Broken)
+
+
+@pytest.mark.parametrize(
+    ("name", "space", "message"),
+    [
+        ("rgb", gym.spaces.Box(0, 255, (64, 64, 3), np.float32), "not float32"),
+        ("joints", gym.spaces.Box(-1, 1, (2,), np.float64), "not float64"),
+    ],
+)
+def test_an_observation_of_the_wrong_type_is_told(name: str, space: gym.Space, message: str) -> None:
+    class Broken(RememberTarget):
+        observation_space = gym.spaces.Dict({**RememberTarget.observation_space.spaces, name: space})
+
+    with pytest.raises(AssertionError, match=f"{name} must be .* {message}"):
+        check_task_class(Broken)
+
+
+def check_task_class(task: type[gym.Env]) -> None:
+    """check_envs on two environments of a task of 20 steps."""
+    gym.register("Checked-v0", task, max_episode_steps=20)
+    try:
+        check_envs(gym.make_vec("Checked-v0", 2, "sync", vector_kwargs={"autoreset_mode": "Disabled"}), "Checked-v0")
+    finally:
+        gym.registry.pop("Checked-v0")

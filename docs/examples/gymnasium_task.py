@@ -74,6 +74,31 @@ def make_envs(args: object) -> gym.vector.VectorEnv:
     return gym.make_vec(TASK, args.num_envs, "sync", vector_kwargs={"autoreset_mode": "Disabled"})
 
 
+def check_envs(envs: gym.vector.VectorEnv, task: str) -> None:
+    """Play one episode twice and check what the scripts rely on; an AssertionError says what is wrong."""
+    steps, seeds = gym.spec(task).max_episode_steps, list(range(envs.num_envs))
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, *envs.action_space.shape)).astype(np.float32)
+    ends = []
+    for _ in range(2):
+        obs, info = envs.reset(seed=seeds)
+        for t in range(steps):
+            rgb, joints = obs["rgb"], obs["joints"]
+            pictures = rgb.dtype == np.uint8 and rgb.ndim == 4 and min(rgb.shape[1:3]) >= 36 and rgb.shape[3] == 3
+            assert pictures, f"rgb must be uint8 of (H, W, 3), at least 36 x 36, not {rgb.dtype} of {rgb.shape[1:]}"
+            vectors = joints.dtype == np.float32 and joints.ndim == 2
+            assert vectors, f"joints must be float32 of (J,), not {joints.dtype} of {joints.shape[1:]}"
+            for name in ("state", "cue", "success"):
+                assert name in info, f"info has no {name} at step {t}"
+                values = np.asarray(info[name])
+                assert values.dtype.kind in "fiu", f"info's {name} must be numbers, not {values.dtype}"
+                assert np.isfinite(values).all(), f"info's {name} is not finite at step {t}"
+            obs, reward, terminated, truncated, info = envs.step(actions[t])
+            assert t == steps - 1 or not (terminated | truncated).any(), f"an episode ended at step {t + 1} of {steps}"
+        ends.append([obs["rgb"], obs["joints"], info["state"], reward])
+    for first, again in zip(*ends, strict=True):
+        assert np.array_equal(first, again), "an episode must follow from its seed and actions"
+
+
 def main() -> None:
     """Run the three stages one after another, with the arguments of the command line."""
     sys.argv += ["--env-id", TASK]
@@ -82,6 +107,9 @@ def main() -> None:
         script.check_task = lambda args: None
     scripts = (aib_repr, aib_belief, ppo_aib)
     arguments = [script.parse_args() for script in scripts]  # all before any runs: a mistake shows at once
+    envs = make_envs(arguments[0])
+    check_envs(envs, TASK)
+    envs.close()
     for script, args in zip(scripts, arguments, strict=True):
         script.main(args)
 
