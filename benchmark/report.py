@@ -350,7 +350,7 @@ def learning_curves(evals: list[dict], path: Path) -> None:
             ax.plot(steps[shown], values[shown], color=COLOURS["AIB"], linestyle="--", label=label)
         if task in CHANCE:
             ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
-        ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}")
+        ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}", fontsize=9)
         ax.set(xlabel="PPO steps", ylim=(-0.03, 1.03))  # curves at 0 beside the axis
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 100k
     axes[0].set_ylabel("success_once")
