@@ -191,7 +191,7 @@ class Agent(nn.Module):
         spaces = envs.single_observation_space
         (action_dim,) = envs.single_action_space.shape
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # standardises by the iterations' mean means and variances; without --joints-norm (nearly) the identity
+        # standardises by means and variances averaged over iterations; without --joints-norm (nearly) the identity
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
