@@ -1,23 +1,19 @@
 """The paper's experiments as plain commands: 4 tasks x 3 methods x 3 seeds, and the ablations on InterceptFast-v0.
 
-Three phases, each built on the one before: stage 1, the beliefs, PPO. Every command is one a person could type; a
-command that was stopped goes on, and one that is finished does nothing.
+Three phases, each built on the one before: stage 1, the beliefs, PPO. A command that was stopped goes on, and one that
+is finished does nothing.
 
-Usage:   python benchmark/experiments.py --dry-run             (print the commands)
-         python benchmark/experiments.py                       (run them here, one after another)
-         bash benchmark/slurm.sh                               (submit them to SLURM)
-         python benchmark/experiments.py --phase 3 --index 5   (run one, as the job array does)
+Usage:   python benchmark/experiments.py             (print the commands)
+         python benchmark/experiments.py | bash -e   (run them here, one after another)
+         bash benchmark/slurm.sh                     (submit them to SLURM)
 """
 
 import shlex
-import subprocess
-import sys
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 import tyro
 
-ROOT = Path(__file__).parent.parent
+PAPER_TASKS = ("RememberShapeAndColor3x2-v0", "RememberColor9-v0", "InterceptMedium-v0", "InterceptFast-v0")
 ABLATIONS = {  # variants of aib_belief.py on InterceptFast-v0: Figures 3 and 4
     "mse": ["--action-head", "mse"],
     "none": ["--action-head", "none"],
@@ -28,16 +24,9 @@ ABLATIONS = {  # variants of aib_belief.py on InterceptFast-v0: Figures 3 and 4
 
 @dataclass
 class Args:
-    tasks: list[str] = field(
-        default_factory=lambda: [
-            "RememberShapeAndColor3x2-v0",
-            "RememberColor9-v0",
-            "InterceptMedium-v0",
-            "InterceptFast-v0",
-        ]
-    )
+    tasks: tuple[str, ...] = PAPER_TASKS
     """tasks of the main experiment"""
-    seeds: list[int] = field(default_factory=lambda: [1, 2, 3])
+    seeds: tuple[int, ...] = (1, 2, 3)
     """seeds of every experiment"""
     ablations: bool = True
     """also the action heads and loss weights on InterceptFast-v0"""
@@ -45,12 +34,8 @@ class Args:
     """with the scripts' --small, on any tasks, without ablations"""
     quick: bool = False
     """with the scripts' --quick, likewise"""
-    dry_run: bool = False
-    """only print the commands"""
     phase: int | None = None
     """only this phase: 1, 2 or 3"""
-    index: int | None = None
-    """only this command of the phase"""
 
 
 def commands(args: Args) -> dict[int, list[list[str]]]:
@@ -77,17 +62,9 @@ def commands(args: Args) -> dict[int, list[list[str]]]:
     return phases
 
 
-def main(args: Args) -> None:
-    """Print or run the chosen commands; stops at the first that fails."""
+if __name__ == "__main__":
+    args = tyro.cli(Args)
     for phase, todo in commands(args).items():
         if args.phase in (None, phase):
-            for words in todo if args.index is None else [todo[args.index]]:
-                print(shlex.join(["python", *words]), flush=True)
-                if not args.dry_run:
-                    code = subprocess.run([sys.executable, str(ROOT / words[0]), *words[1:]]).returncode
-                    if code:
-                        sys.exit(code)
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Args))
+            for words in todo:
+                print(shlex.join([".venv/bin/python", *words]))

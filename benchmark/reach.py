@@ -52,7 +52,7 @@ class Args:
     """simulator processes"""
 
 
-class RandomGoal(gym.Wrapper):
+class RandomGoal(gym.ObservationWrapper):
     """Adds goal (3,) to the observation: the position of an object that is drawn by the episode's seed."""
 
     def __init__(self, env: gym.Env):
@@ -62,17 +62,12 @@ class RandomGoal(gym.Wrapper):
         goal = gym.spaces.Box(-np.inf, np.inf, (3,))
         self.observation_space = gym.spaces.Dict({**env.observation_space.spaces, "goal": goal})
 
-    def _show(self, obs: dict) -> dict:
-        return {**obs, "goal": self.goal.pose.p[0].numpy()}
-
     def reset(self, *, seed: int, options: dict | None = None) -> tuple:
-        obs, info = self.env.reset(seed=seed, options=options)
         self.goal = self.objects[np.random.default_rng(seed).integers(len(self.objects))]
-        return self._show(obs), info
+        return super().reset(seed=seed, options=options)
 
-    def step(self, action: np.ndarray) -> tuple:
-        obs, *others = self.env.step(action)
-        return self._show(obs), *others
+    def observation(self, obs: dict) -> dict:
+        return {**obs, "goal": self.goal.pose.p[0].numpy()}
 
 
 def make_envs(args: ppo_baseline.Args) -> gym.vector.VectorEnv:

@@ -42,7 +42,9 @@ CHANCE = {  # one of so many objects is the right one
     "RememberShapeAndColor3x2-v0": 1 / 6,
 }
 HEAD_SETTING = "128 px, 2000 episodes, 700 updates"
-WHITE_SETTING = "raw rewards, raw joints, 128 px, white noise"  # without what lets --small learn in few steps
+PROBES = {"cue_chance": "chance of the cue", "cue_from_u": "cue from u", "cue_from_h": "cue from h"}
+PROBES |= {"cue_from_particle": "cue from particles", "u_r2_prior": "R² of u", "action_readout": "R² of a_t"}
+PROBES |= {"nll_prior": "−log p(u), prior", "nll_posterior": "posterior", "flow_gain": "flow gain"}
 ORACLE_STEPS = (28800, 57600, 86400, 115200, 144000, 240000, 480000)
 
 
@@ -233,39 +235,23 @@ def pairs_table(evals: list[dict], tests: list[dict]) -> str:
     return markdown([*head, "test: AIB", "Believer", "difference"], [*rows, total])
 
 
-def belief_cell(beliefs: list[dict], task: str, method: str, setting: str, metric: str) -> str:
-    """A metric at the last time step, of each seed."""
-    curves = by_seed(beliefs, "value", task=task, method=method, setting=setting, metric=metric)
-    return summarise([values[-1] for _, values in curves.values()])
+def belief_cell(beliefs: list[dict], metric: str, **chosen: str) -> str:
+    """A metric at the last time step, of each seed; the cue's chance once, as it is the same for all."""
+    found = [values[-1] for _, values in by_seed(beliefs, "value", metric=metric, **chosen).values()]
+    return summarise(found[:1] if metric == "cue_chance" else found)
 
 
-def beliefs_table(beliefs: list[dict]) -> str:
-    """What AIB's beliefs know at the last step of held-out random episodes."""
+def beliefs_table(beliefs: list[dict], table: str, methods: list[str], metrics: list[str]) -> str:
+    """What beliefs know at the last step of held-out episodes; in one setting all methods have the same ones and u."""
     rows = []
-    for task, setting in rows_of("beliefs"):
-        cells = []
-        for metric in ("cue_from_u", "cue_from_h", "cue_from_particle", "u_r2_prior"):
-            cells.append(belief_cell(beliefs, task, "AIB", setting, metric))
-        chance = by_seed(beliefs, "value", task=task, setting=setting, metric="cue_chance")
-        rows.append([task.removesuffix("-v0"), setting, f"{next(iter(chance.values()))[1][0]:.2f}", *cells])
-    head = ["task", "setting", "chance of the cue", "cue from u", "cue from h", "cue from particles", "R² of u"]
-    return markdown(head, rows)
-
-
-def heads_table(beliefs: list[dict]) -> str:
-    """The action heads and Believer on the same episodes and u."""
-    rows = []
-    for task, setting in rows_of("heads"):
-        for method in HEADS.values():
-            cells = []
-            for metric in ("cue_from_particle", "u_r2_prior", "action_readout"):
-                cells.append(belief_cell(beliefs, task, method, setting, metric))
-            chosen = {"task": task, "method": method, "setting": setting, "metric": "u_r2_prior"}
-            seeds = ", ".join(by_seed(beliefs, "value", **chosen))
+    for task, setting in rows_of(table):
+        for method in methods:
+            chosen = {"task": task, "method": method, "setting": setting}
+            seeds = ", ".join(by_seed(beliefs, "value", **chosen, metric="u_r2_prior"))
             if seeds:
-                rows.append([task.removesuffix("-v0"), setting, method, seeds, *cells])
-    head = ["task", "setting", "head", "seeds", "cue from particles", "R² of u", "R² of a_t"]
-    return markdown(head, rows)
+                cells = [belief_cell(beliefs, metric, **chosen) for metric in metrics]
+                rows.append([task.removesuffix("-v0"), method, setting, seeds, *cells])
+    return markdown(["task", "method", "setting", "seeds", *[PROBES[metric] for metric in metrics]], rows)
 
 
 def oracle_table(evals: list[dict]) -> str:
@@ -343,11 +329,6 @@ def learning_curves(evals: list[dict], path: Path) -> None:
             curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
             draw(ax, curves, method, COLOURS[method])
             seeds.append(f"{len(curves)} {method}")
-        if setting == "small":
-            ((steps, values),) = by_seed(evals, "success_once", task=task, method="AIB", setting=WHITE_SETTING).values()
-            shown = steps <= 120_000
-            label = "AIB, white noise, raw rewards and joints (1 seed)"
-            ax.plot(steps[shown], values[shown], color=COLOURS["AIB"], linestyle="--", label=label)
         if task in CHANCE:
             ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
         ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}", fontsize=9)
@@ -390,8 +371,10 @@ def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
     evals, tests, beliefs = read("eval.csv"), read("test.csv"), read("beliefs.csv")
     tables = {name: agents_table(name, evals, tests) for name in ("agents", "choices")}
-    tables |= {"results": results_table(evals), "pairs": pairs_table(evals, tests), "beliefs": beliefs_table(beliefs)}
-    tables |= {"heads": heads_table(beliefs), "oracle": oracle_table(evals), "shift": shift_table(evals, tests)}
+    tables |= {"results": results_table(evals), "pairs": pairs_table(evals, tests)}
+    tables |= {"oracle": oracle_table(evals), "shift": shift_table(evals, tests)}
+    tables["beliefs"] = beliefs_table(beliefs, "beliefs", ["AIB"], list(PROBES)[:5])
+    tables["heads"] = beliefs_table(beliefs, "heads", list(HEADS.values()), list(PROBES)[3:6])
     for page in ("README.md", "docs/results.md"):
         (output / page).write_text(replace_tables((ROOT / page).read_text(), tables))
     learning_curves(evals, output / "benchmark" / "results" / "learning_curves.png")
@@ -400,13 +383,11 @@ def rebuild(output: Path) -> None:
 
 def own_beliefs(beliefs: list[dict], task: str) -> str:
     """The beliefs of one task by setting (exp_name): metrics at the last time step of held-out random episodes."""
-    metrics = {"cue_from_h": "cue from h", "cue_from_particle": "cue from particles", "u_r2_prior": "R² of u"}
-    metrics |= {"nll_prior": "−log p(u), prior", "nll_posterior": "posterior"}
-    metrics |= {"action_readout": "R² of a_t", "flow_gain": "flow gain"}
     rows = []
     for setting, method in sorted({(row["setting"], row["method"]) for row in beliefs if row["task"] == task}):
-        rows.append([setting, *[belief_cell(beliefs, task, method, setting, metric) for metric in metrics]])
-    return markdown([task, *metrics.values()], rows)
+        chosen = {"task": task, "method": method, "setting": setting}
+        rows.append([setting, *[belief_cell(beliefs, metric, **chosen) for metric in PROBES]])
+    return markdown([task, *PROBES.values()], rows)
 
 
 def own_runs(evals: list[dict], task: str) -> str:

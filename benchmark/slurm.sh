@@ -18,16 +18,18 @@ if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
     mkdir -p runs
     after=
     for phase in 1 2 3; do
-        count=$(.venv/bin/python benchmark/experiments.py "$@" --dry-run --phase "$phase" | wc -l)
-        job=$(sbatch --parsable --array="0-$((count - 1))" $after --export="ALL,PHASE=$phase" "$0" "$@")
+        count=$(.venv/bin/python benchmark/experiments.py "$@" --phase "$phase" | wc -l)
+        job=$(sbatch --parsable --array="1-$count" $after --export="ALL,PHASE=$phase" "$0" "$@")
         echo "phase $phase: $count jobs, array $job"
         after="--dependency=afterok:$job"
     done
     exit 0
 fi
 
-.venv/bin/python benchmark/experiments.py "$@" --phase "$PHASE" --index "$SLURM_ARRAY_TASK_ID" &
+command=$(.venv/bin/python benchmark/experiments.py "$@" --phase "$PHASE" | sed -n "${SLURM_ARRAY_TASK_ID}p")
+echo "$command"
+$command &
 child=$!
 # an abrupt end loses nothing but the work since the last checkpoint
-trap 'scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"; pkill -P "$child"' USR1
+trap 'scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"; kill "$child"' USR1
 wait "$child"
