@@ -109,6 +109,17 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
     assert json.dumps(metrics, indent=2) in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
+def test_nearest_evaluates_an_agent_and_writes_nothing(quick_runs: Path) -> None:
+    path = quick_runs / f"{TASK}__ppo_baseline_quick__1"
+    before = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
+    options = ["--num-eval-episodes", "3", "--num-workers", "2"]
+    code, out, err = run("benchmark/nearest", "--checkpoint", str(path / "agent.pt"), *options, cwd=quick_runs.parent)
+    assert code == 0 and 0 <= json.loads(out[out.index("{") :])["nearest_is_right"] <= 1, err
+    assert before == {file: file.stat().st_mtime_ns for file in path.rglob("*")}
+    code, _, err = run("benchmark/nearest", "--checkpoint", str(path / "checkpoint.pt"), cwd=quick_runs.parent)
+    assert code == 2 and "is no agent of a task of objects" in err
+
+
 def test_reach_plays_every_second_scene_anew_and_stage_2_takes_it(
     quick_runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

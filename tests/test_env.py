@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import sapien
 import torch
+from mani_skill.utils.structs import Pose
 
 import aib_belief
 import aib_repr
@@ -17,6 +18,7 @@ import ppo_baseline
 from conftest import ROOT, TASK, spaces
 
 sys.path.append(str(ROOT / "benchmark"))
+import nearest  # noqa: E402
 import true_state  # noqa: E402
 
 # RememberColor9's nine colours have six hues on the screen: maroon is a dark red, olive reads as yellow, teal as cyan
@@ -124,6 +126,22 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
     tcp, target = obs["joints"][18:21], obs["joints"][25:]
     assert np.allclose(target - tcp, env.unwrapped.obj_to_goal_pos, atol=1e-4)
     del env.unwrapped._get_obs_sensor_data
+
+
+def test_nearest_object_tells_the_right_one(env: gym.Env) -> None:
+    task, told = env.unwrapped, nearest.NearestObject(env)
+    _, info = told.reset(seed=5)
+    right = int(info["cue"][0])
+    for _ in range(12):  # until the objects stand on the table
+        told.step(np.zeros(8, np.float32))
+    for key in (right, (right + 1) % 9, right):
+        hand = task.agent.tcp.pose.p
+        for other, cube in task.cubes.items():
+            place = hand + torch.tensor([[0.0, 0.0, 0.05 if other == key else 0.5 + other]])
+            cube.pose = Pose.create_from_pq(place, cube.pose.q)
+        assert told.step(np.zeros(8, np.float32))[1] == (key == right)
+    buffer = {"rewards": torch.tensor([[1.0, 1.0], [0.0, 1.0]]), "success": torch.tensor([[1.0, 0.0], [0.0, 0.0]])}
+    assert nearest.nearest_and_success(buffer) == {"nearest_is_right": 0.5, "success_once": 0.5}
 
 
 def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:
