@@ -3,7 +3,7 @@
 Usage:   python benchmark/report.py                                  (README.md, docs/results.md and their figures)
          python benchmark/report.py --runs runs                      (learning curves and last values of your runs)
          python benchmark/report.py --runs runs --add small    (append your runs to eval.csv, test.csv, beliefs.csv)
-Reads:   benchmark/results/: eval.csv, test.csv, beliefs.csv, paper.csv, tables.csv (which rows tables show, in order);
+Reads:   benchmark/results/: eval.csv, test.csv, beliefs.csv, nearest.csv, paper.csv, tables.csv (rows of tables);
          or runs/*/: args.json with eval.csv, evaluation.json (of --evaluate), diagnostics.json
 Writes:  tables between <!-- name --> and <!-- end --> in the pages, PNG figures; or benchmark/report/
 """
@@ -254,6 +254,17 @@ def beliefs_table(beliefs: list[dict], table: str, methods: list[str], metrics: 
     return markdown(["task", "method", "setting", "seeds", *[PROBES[metric] for metric in metrics]], rows)
 
 
+def nearest_table() -> str:
+    """benchmark/nearest.py's numbers on 256 test episodes."""
+    rows = []
+    for row in read("nearest.csv"):
+        run = [row["task"].removesuffix("-v0"), row["method"], row["setting"], row["seed"], f"{int(row['step']):,}"]
+        cells = [f"{float(row[name]):.2f}" for name in ("success_once", "nearest_is_right")]
+        rows.append([*run, f"{CHANCE[row['task']]:.2f}", *cells])
+    head = ["task", "method", "setting", "seed", "PPO steps", "chance", "success_once", "nearest is the right object"]
+    return markdown(head, rows)
+
+
 def oracle_table(evals: list[dict]) -> str:
     """PPO without pictures on the privileged state, on u or on the target position: success_once of each seed.
 
@@ -373,6 +384,7 @@ def rebuild(output: Path) -> None:
     tables = {name: agents_table(name, evals, tests) for name in ("agents", "choices")}
     tables |= {"results": results_table(evals), "pairs": pairs_table(evals, tests)}
     tables |= {"oracle": oracle_table(evals), "shift": shift_table(evals, tests)}
+    tables["nearest"] = nearest_table()
     tables["beliefs"] = beliefs_table(beliefs, "beliefs", ["AIB"], list(PROBES)[:5])
     tables["heads"] = beliefs_table(beliefs, "heads", list(HEADS.values()), list(PROBES)[3:6])
     for page in ("README.md", "docs/results.md"):
