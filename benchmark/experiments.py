@@ -32,8 +32,6 @@ class Args:
     """also the action heads and loss weights on InterceptFast-v0"""
     small: bool = False
     """with the scripts' --small, on any tasks, without ablations"""
-    quick: bool = False
-    """with the scripts' --quick, likewise"""
     phase: int | None = None
     """only this phase: 1, 2 or 3"""
 
@@ -41,11 +39,7 @@ class Args:
 def commands(args: Args) -> dict[int, list[list[str]]]:
     """The commands of each phase, as lists of words after `python`."""
     phases = {1: [], 2: [], 3: []}
-    size = []
-    if args.small:
-        size.append("--small")
-    if args.quick:
-        size.append("--quick")
+    size = ["--small"] if args.small else []
     for task in args.tasks:
         for seed in args.seeds:
             run = ["--env-id", task, "--seed", str(seed), *size]

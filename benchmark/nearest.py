@@ -3,7 +3,7 @@
 A success asks for both: a hand at rest within 5 cm of the right object. Which object is nearest at the last step tells
 what the agent took for the right one, however well it reached.
 
-Usage:   python benchmark/nearest.py --checkpoint runs/RememberColor5-v0__ppo_aib_small__1/agent.pt
+Usage:   python benchmark/nearest.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
 Prints:  the evaluation with nearest_is_right in place of return; writes nothing
 """
 
@@ -49,6 +49,7 @@ def nearest_and_success(buffer: dict[str, Tensor]) -> dict[str, float]:
     return {
         "nearest_is_right": buffer["rewards"][-1].mean().item(),
         "success_once": buffer["success"].amax(0).mean().item(),
+        "success_at_end": buffer["success"][-1].mean().item(),
     }
 
 
@@ -68,8 +69,8 @@ def main(args: Args) -> None:
 
     script.make_envs, script.success_and_return = make_envs, nearest_and_success
     script.save = lambda path, content: None
-    settings = script.Args(checkpoint=str(args.checkpoint), num_eval_episodes=args.num_eval_episodes)
-    settings.sim_backend = "physx_cpu"
+    settings = script.Args(checkpoint=str(args.checkpoint), sim_backend="physx_cpu")
+    settings.num_eval_episodes = args.num_eval_episodes
     script.evaluate_checkpoint(settings)
 
 

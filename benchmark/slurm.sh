@@ -7,11 +7,13 @@
 #SBATCH --requeue
 #SBATCH --signal=B:USR1@120
 #SBATCH --output=runs/slurm-%x-%A_%a.log
+#SBATCH --open-mode=append
 #
 # Submit all of the paper's experiments with one line, from the repository's root:   bash benchmark/slurm.sh
 # or some, with arguments of experiments.py:   bash benchmark/slurm.sh --small --tasks RememberColor3-v0
 # Three job arrays follow one another: stage 1, the beliefs, PPO. A job that is preempted or runs into its time limit
-# is queued again and goes on from its last checkpoint. Change the lines above to what your cluster wants.
+# is queued again and goes on from its last checkpoint. Where a job fails the later arrays are cancelled: submit again,
+# finished commands do nothing. Change the lines above to what your cluster wants.
 set -euo pipefail
 
 if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
@@ -21,7 +23,7 @@ if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
         count=$(.venv/bin/python benchmark/experiments.py "$@" --phase "$phase" | wc -l)
         job=$(sbatch --parsable --array="1-$count" $after --export="ALL,PHASE=$phase" "$0" "$@")
         echo "phase $phase: $count jobs, array $job"
-        after="--dependency=afterok:$job"
+        after="--dependency=afterok:$job --kill-on-invalid-dep=yes"
     done
     exit 0
 fi
