@@ -10,6 +10,7 @@ Usage:   python benchmark/experiments.py             (print the commands)
 
 import shlex
 from dataclasses import dataclass
+from typing import Literal
 
 import tyro
 
@@ -32,8 +33,8 @@ class Args:
     """also the action heads and loss weights on InterceptFast-v0"""
     small: bool = False
     """with the scripts' --small, on any tasks, without ablations"""
-    phase: int | None = None
-    """only this phase: 1, 2 or 3"""
+    phase: Literal[1, 2, 3] | None = None
+    """only this phase"""
 
 
 def commands(args: Args) -> dict[int, list[list[str]]]:
