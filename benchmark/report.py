@@ -285,20 +285,20 @@ def oracle_table(evals: list[dict]) -> str:
     return markdown(["task", "the policy sees", "setting", "seeds", *[f"{step:,}" for step in ORACLE_STEPS]], rows)
 
 
-def shift_table(evals: list[dict], tests: list[dict]) -> str:
-    """R² of u at the last step of the agents' own episodes: first evaluation, last; on test episodes."""
+def shift_table(evals: list[dict], tests: list[dict], beliefs: list[dict]) -> str:
+    """R² of u at the last step: held-out episodes; the agent's in its first and last evaluation; test episodes."""
     rows = []
     for task, setting in rows_of("agents"):
         for method in METHODS.values():
             chosen = {"task": task, "method": method, "setting": setting}
             success = by_seed(evals, "success_once", **chosen)
             for seed, (steps, known) in by_seed(evals, "u_r2_at_end", **chosen).items():
-                cells = [seed, f"{steps[-1]:,.0f}"]
-                cells += [f"{known[0]:.2f}", f"{known[-1]:.2f}"]
+                held_out = belief_cell(beliefs, "u_r2_prior", seed=seed, **chosen)
+                cells = [seed, f"{steps[-1]:,.0f}", held_out, f"{known[0]:.2f}", f"{known[-1]:.2f}"]
                 tested = by_seed(tests, "u_r2_at_end", seed=seed, **chosen)
                 cells.append(f"{tested[seed][1][-1]:.2f}" if tested else "")
                 rows.append([task.removesuffix("-v0"), method, setting, *cells, f"{success[seed][1][-1]:.2f}"])
-    head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, first", "last", "test"]
+    head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, held-out", "agent's, first", "last", "test"]
     return markdown([*head, "success_once, last"], rows)
 
 
@@ -384,7 +384,7 @@ def rebuild(output: Path) -> None:
     evals, tests, beliefs = read("eval.csv"), read("test.csv"), read("beliefs.csv")
     tables = {name: agents_table(name, evals, tests) for name in ("agents", "choices")}
     tables |= {"results": results_table(evals), "pairs": pairs_table(evals, tests)}
-    tables |= {"oracle": oracle_table(evals), "shift": shift_table(evals, tests)}
+    tables |= {"oracle": oracle_table(evals), "shift": shift_table(evals, tests, beliefs)}
     tables["nearest"] = nearest_table(tests)
     tables["beliefs"] = beliefs_table(beliefs, "beliefs", ["AIB"], list(PROBES)[:5])
     tables["heads"] = beliefs_table(beliefs, "heads", list(HEADS.values()), list(PROBES)[3:6])
