@@ -119,9 +119,9 @@ class Args:
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
     final_std: float | None = None
-    """standard deviation at the end of total_timesteps, reached linearly; None: it is learnt, as in the paper"""
+    """standard deviation at the end of total_timesteps, reached linearly; None: it is learnt"""
     noise_beta: float = 0.0
-    """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, the paper's; 1 is pink"""
+    """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, 1 is pink"""
     joints_norm: bool = False
     """standardise the policy's joints by their running mean and standard deviation"""
     amp: bool = False

@@ -1,14 +1,14 @@
 """The Believer baseline after stage 1 (Wang et al., 2023): a belief with a fixed prior, then PPO on observation and it.
 
 Where aib_belief.py learns a prior p(z|h) and shapes z by inverse dynamics, Believer draws z from N(0, I) and has no
-action head. Networks, settings, PPO, evaluation and tags are those of aib_belief.py and ppo_aib.py.
+action head. Networks, settings, PPO and evaluation are those of aib_belief.py and ppo_aib.py.
 
 Usage:   python ppo_believer.py --env-id InterceptFast-v0
          python ppo_believer.py --evaluate --checkpoint runs/InterceptFast-v0__ppo_believer__1/agent.pt
-Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt, or --repr-dir; where
-         the former has no repr.pt, aib_repr.py runs first
-Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, agent.pt, eval.csv, videos/, TensorBoard events; args.json and
-         checkpoint.pt to resume; with --evaluate evaluation.json and .mp4 beside agent.pt
+Reads:   runs/{env_id}__aib_repr__{seed}/: dataset/, repr.pt (where missing aib_repr.py runs first), or --repr-dir
+Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, agent.pt, eval.csv, videos/, TensorBoard events (the belief's
+         in belief_events/); args.json, belief_checkpoint.pt and checkpoint.pt to resume; with --evaluate
+         evaluation.json and .mp4 beside agent.pt
 """
 
 import ctypes
@@ -168,9 +168,9 @@ class Args:
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
     final_std: float | None = None
-    """standard deviation at the end of total_timesteps, reached linearly; None: it is learnt, as in the paper"""
+    """standard deviation at the end of total_timesteps, reached linearly; None: it is learnt"""
     noise_beta: float = 0.0
-    """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, the paper's; 1 is pink"""
+    """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, 1 is pink"""
     joints_norm: bool = False
     """standardise the policy's joints by their running mean and standard deviation"""
     amp: bool = False
