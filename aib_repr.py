@@ -364,7 +364,7 @@ def main(args: Args) -> None:
     else:
         size = args.num_episodes * (gym.spec(args.env_id).max_episode_steps + 1) * args.image_size**2 * 3
         if size > shutil.disk_usage("runs" if Path("runs").exists() else ".").free:
-            fail(f"the pictures take {size / 1e9:.1f} GB, more than the disk has free; clear it or lower --num-episodes")
+            fail(f"the pictures take {size / 1e9:.1f} GB, more than the disk has; free some or lower --num-episodes")
     open_run(path, args)
     arrays = collect_random_episodes(args, path / "dataset")
     transitions = TransitionDataset(path / "dataset", args.psi_images, device)

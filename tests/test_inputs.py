@@ -340,7 +340,7 @@ def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.Cap
     "script, wrong, words",
     [
         ("aib_repr", dict(val_fraction=0.0), ["--val-fraction 0.0"]),
-        ("aib_repr", dict(num_episodes=10**10), ["more than the disk has free", "--num-episodes"]),
+        ("aib_repr", dict(num_episodes=10**10), ["more than the disk has", "--num-episodes"]),
         ("aib_belief", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
         ("ppo_aib", dict(belief="nope.pt"), ["nope.pt does not exist"]),
         ("ppo_believer", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
