@@ -13,6 +13,7 @@ import json
 import re
 import sys
 from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -138,6 +139,15 @@ def by_seed(rows: list[dict], column: str, **chosen: str) -> dict[str, tuple[np.
     return {seed: tuple(np.array(sorted(pairs)).T) for seed, pairs in sorted(found.items())}
 
 
+def runs_of(table: str, methods: Iterable[str], rows: list[dict], column: str) -> Iterator[tuple[dict, list, dict]]:
+    """What selects the runs of each row of a table and each method that has some; its cells; the column by seed."""
+    for task, setting in rows_of(table):
+        for method in methods:
+            chosen = {"task": task, "method": method, "setting": setting}
+            if curves := by_seed(rows, column, **chosen):
+                yield chosen, [task.removesuffix("-v0"), method, setting], curves
+
+
 def last_three(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[float]:
     """The paper's summary of each seed: the mean of the last three evaluations."""
     return [values[-3:].mean() for _, values in curves.values()]
@@ -188,22 +198,16 @@ def agents_table(table: str, evals: list[dict], tests: list[dict]) -> str:
     """Agents with pictures: success_once and success_at_end; the last agents' on test episodes."""
     rows = []
     before = {row["setting"]: row["steps_before_ppo"] for row in read("settings.csv")}
-    for task, setting in rows_of(table):
-        for method in METHODS.values():
-            chosen = {"task": task, "method": method, "setting": setting}
-            curves = by_seed(evals, "success_once", **chosen)
-            if not curves:
-                continue
-            steps = min(curve[0][-1] for curve in curves.values())
-            steps_before = 0 if method == "PPO" else int(before[setting])
-            cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
-            for metric in METRICS[:2]:
-                tested = by_seed(tests, metric, **chosen)
-                cells.append(summarise([values[-1] for _, values in tested.values()]))
-                if 0 < len(tested) < len(curves):
-                    cells[-1] += f" (seed {', '.join(tested)})"
-            run = [setting, ", ".join(curves), f"{steps_before:,}", f"{steps:,.0f}"]
-            rows.append([task.removesuffix("-v0"), method, *run, *cells])
+    for chosen, run, curves in runs_of(table, METHODS.values(), evals, "success_once"):
+        steps = min(curve[0][-1] for curve in curves.values())
+        steps_before = 0 if chosen["method"] == "PPO" else int(before[chosen["setting"]])
+        cells = [summarise(last_three(by_seed(evals, metric, **chosen))) for metric in METRICS[:2]]
+        for metric in METRICS[:2]:
+            tested = by_seed(tests, metric, **chosen)
+            cells.append(summarise([values[-1] for _, values in tested.values()]))
+            if 0 < len(tested) < len(curves):
+                cells[-1] += f" (seed {', '.join(tested)})"
+        rows.append([*run, ", ".join(curves), f"{steps_before:,}", f"{steps:,.0f}", *cells])
     head = ["task", "method", "setting", "seeds", "steps before", "PPO steps", *METRICS[:2], "test: once", "at end"]
     return markdown(head, rows)
 
@@ -244,13 +248,9 @@ def belief_cell(beliefs: list[dict], metric: str, **chosen: str) -> str:
 def beliefs_table(beliefs: list[dict], table: str, methods: list[str], metrics: list[str]) -> str:
     """What beliefs know at the last step of held-out episodes; in one setting all methods have the same ones and u."""
     rows = []
-    for task, setting in rows_of(table):
-        for method in methods:
-            chosen = {"task": task, "method": method, "setting": setting}
-            seeds = ", ".join(by_seed(beliefs, "value", **chosen, metric="u_r2_prior"))
-            if seeds:
-                cells = [belief_cell(beliefs, metric, **chosen) for metric in metrics]
-                rows.append([task.removesuffix("-v0"), method, setting, seeds, *cells])
+    known = [row for row in beliefs if row["metric"] == "u_r2_prior"]
+    for chosen, run, curves in runs_of(table, methods, known, "value"):
+        rows.append([*run, ", ".join(curves), *[belief_cell(beliefs, metric, **chosen) for metric in metrics]])
     return markdown(["task", "method", "setting", "seeds", *[PROBES[metric] for metric in metrics]], rows)
 
 
@@ -272,32 +272,25 @@ def oracle_table(evals: list[dict]) -> str:
     The last evaluation until each step.
     """
     rows = []
-    for task, setting in rows_of("oracle"):
-        for method in ORACLES.values():
-            curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
-            if not curves:
-                continue
-            cells = [setting, ", ".join(curves)]
-            for step in ORACLE_STEPS:
-                reached = [values[steps <= step][-1] for steps, values in curves.values() if steps[-1] > 0.95 * step]
-                cells.append(", ".join(f"{value:.2f}" for value in reached))
-            rows.append([task.removesuffix("-v0"), method.removeprefix("oracle "), *cells])
+    for _, (task, method, setting), curves in runs_of("oracle", ORACLES.values(), evals, "success_once"):
+        rows.append([task, method.removeprefix("oracle "), setting, ", ".join(curves)])
+        for step in ORACLE_STEPS:
+            reached = [values[steps <= step][-1] for steps, values in curves.values() if steps[-1] > 0.95 * step]
+            rows[-1].append(", ".join(f"{value:.2f}" for value in reached))
     return markdown(["task", "the policy sees", "setting", "seeds", *[f"{step:,}" for step in ORACLE_STEPS]], rows)
 
 
 def shift_table(evals: list[dict], tests: list[dict], beliefs: list[dict]) -> str:
     """R² of u at the last step: held-out episodes; the agent's in its first and last evaluation; test episodes."""
     rows = []
-    for task, setting in rows_of("agents"):
-        for method in METHODS.values():
-            chosen = {"task": task, "method": method, "setting": setting}
-            success = by_seed(evals, "success_once", **chosen)
-            for seed, (steps, known) in by_seed(evals, "u_r2_at_end", **chosen).items():
-                held_out = belief_cell(beliefs, "u_r2_prior", seed=seed, **chosen)
-                cells = [seed, f"{steps[-1]:,.0f}", held_out, f"{known[0]:.2f}", f"{known[-1]:.2f}"]
-                tested = by_seed(tests, "u_r2_at_end", seed=seed, **chosen)
-                cells.append(f"{tested[seed][1][-1]:.2f}" if tested else "")
-                rows.append([task.removesuffix("-v0"), method, setting, *cells, f"{success[seed][1][-1]:.2f}"])
+    for chosen, run, curves in runs_of("agents", METHODS.values(), evals, "u_r2_at_end"):
+        success = by_seed(evals, "success_once", **chosen)
+        for seed, (steps, known) in curves.items():
+            held_out = belief_cell(beliefs, "u_r2_prior", seed=seed, **chosen)
+            tested = by_seed(tests, "u_r2_at_end", seed=seed, **chosen)
+            test = f"{tested[seed][1][-1]:.2f}" if tested else ""
+            cells = [held_out, f"{known[0]:.2f}", f"{known[-1]:.2f}", test, f"{success[seed][1][-1]:.2f}"]
+            rows.append([*run, seed, f"{steps[-1]:,.0f}", *cells])
     head = ["task", "method", "setting", "seed", "PPO steps", "R² of u, held-out", "agent's, first", "last", "test"]
     return markdown([*head, "success_once, last"], rows)
 
