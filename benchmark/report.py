@@ -159,10 +159,10 @@ def bootstrap_interval(values: list[float]) -> tuple[float, float]:
 
 
 def summarise(values: list[float]) -> str:
-    """Mean (each seed); from five on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
+    """Mean (each seed); from six on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
     if len(values) < 2:
         return "".join(f"{value:.2f}" for value in values)
-    if len(values) < 5:
+    if len(values) < 6:
         return f"{np.mean(values):.2f} ({', '.join(f'{value:.2f}' for value in values)})"
     low, high = bootstrap_interval(values)
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} [{low:.2f}, {high:.2f}]"

@@ -58,12 +58,12 @@ def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     assert iio.imread(tmp_path / "report" / "learning_curves.png").std() > 10
 
 
-def test_five_seeds_have_a_bootstrap_interval() -> None:
-    values = [0.1, 0.2, 0.3, 0.4, 0.5]
-    text = report.summarise(values)
-    assert text.startswith("0.30 ± 0.16 [")  # sample deviation 0.1581; the mean's standard error is near 0.063
+def test_six_seeds_have_a_bootstrap_interval() -> None:
+    assert report.summarise([0.1, 0.2, 0.3, 0.4, 0.5]) == "0.30 (0.10, 0.20, 0.30, 0.40, 0.50)"
+    text = report.summarise([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    assert text.startswith("0.35 ± 0.19 [")  # sample deviation 0.1871; the mean's standard error is near 0.070
     low, high = text.split("[")[1].rstrip("]").split(", ")
-    assert 0.15 < float(low) < 0.2 and 0.4 < float(high) < 0.45
+    assert 0.2 < float(low) < 0.25 and 0.45 < float(high) < 0.5
 
 
 def test_aib_and_believer_are_compared_at_equal_steps(monkeypatch: pytest.MonkeyPatch) -> None:
