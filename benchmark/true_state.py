@@ -17,6 +17,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import gymnasium as gym
 import numpy as np
@@ -38,6 +39,7 @@ class Args(ppo_baseline.Args):
     """the target position in place of the state; only in Remember tasks, whose state is the cue and object positions"""
     pictures: bool = False
     """show the picture, too"""
+    sim_backend: Literal["physx_cpu"] = "physx_cpu"
 
 
 class ShowState(gym.Wrapper):
@@ -130,7 +132,7 @@ if __name__ == "__main__":
     name = "true_target" if args.target else "true_u" if phi else "true_state"
     if args.pictures:
         name += "_pictures"
-    args.exp_name, args.sim_backend = args.exp_name.replace("ppo_baseline", name), "physx_cpu"
+    args.exp_name = args.exp_name.replace("ppo_baseline", name)
     if args.evaluate:
         ppo_baseline.evaluate_checkpoint(args)
     else:
