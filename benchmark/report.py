@@ -10,6 +10,7 @@ Writes:  tables between <!-- name --> and <!-- end --> in the pages, PNG figures
 
 import csv
 import json
+import math
 import re
 import sys
 from collections import defaultdict
@@ -327,8 +328,8 @@ def learning_curves(evals: list[dict], path: Path) -> None:
     for task, setting in rows_of("results"):
         if by_seed(evals, "success_once", task=task, setting=setting):
             panels.setdefault(task, setting)
-    figure, axes = plt.subplots(1, len(panels), figsize=(12, 3.4), layout="constrained", sharey=True)
-    for ax, (task, setting) in zip(axes, panels.items(), strict=True):
+    figure, axes = plt.subplots(2, math.ceil(len(panels) / 2), figsize=(12, 6), layout="constrained", sharey=True)
+    for ax, (task, setting) in zip(axes.flat, panels.items(), strict=False):
         seeds = []
         for method in METHODS.values():
             curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
@@ -339,7 +340,8 @@ def learning_curves(evals: list[dict], path: Path) -> None:
         ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {', '.join(seeds)}", fontsize=9)
         ax.set(xlabel="PPO steps", ylim=(-0.03, 1.03))  # curves at 0 beside the axis
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 100k
-    axes[0].set_ylabel("success_once")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("success_once")
     save_figure(figure, axes, path)
 
 
