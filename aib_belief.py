@@ -68,7 +68,7 @@ class Args:
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
-    """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
+    """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
     small: bool = False
@@ -81,7 +81,7 @@ class Args:
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """random episodes of stage 1, made if they are missing, else the number that its dataset has"""
+    """random episodes of stage 1, made if they are missing; must be the number that its dataset has"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 3) are taken to be updates"""
     batch_episodes: int = 256

@@ -73,7 +73,7 @@ class Args:
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
-    """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
+    """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
     small: bool = False
@@ -517,8 +517,8 @@ def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
 def decimate_meshes(task: gym.Env, triangles: int) -> None:
     """Draw the robot with about so many triangles per mesh and the ground with two; objects are drawn as they are.
 
-    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground has
-    20,000, between a square of vertices in a plane: its corners draw the same picture.
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground is
+    a flat grid of 20,000: its four corners draw the same picture.
     """
     for link in task.agent.robot.get_links():
         entities, meshes = [body.entity for body in link._objs], []  # one per scene

@@ -83,7 +83,7 @@ class Args:
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
-    """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
+    """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
     small: bool = False
@@ -96,7 +96,7 @@ class Args:
     belief: str = "runs/{env_id}__aib_belief__{seed}/belief.pt"
     """belief of stage 2"""
     num_episodes: int = 2000
-    """random episodes of stage 1, made if they are missing, else the number that the belief was trained with"""
+    """random episodes of stage 1, made if they are missing; must be the number that the belief was trained with"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
     sample_decoder: bool = True
@@ -155,7 +155,7 @@ LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
 LIMITS |= dict(init_std=(0.001, math.inf), final_std=(0.001, math.inf))
 LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
-TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
+TASKS = {  # Table 5, where it differs from the defaults above
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
@@ -703,8 +703,8 @@ def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
 def decimate_meshes(task: gym.Env, triangles: int) -> None:
     """Draw the robot with about so many triangles per mesh and the ground with two; objects are drawn as they are.
 
-    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground has
-    20,000, between a square of vertices in a plane: its corners draw the same picture.
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground is
+    a flat grid of 20,000: its four corners draw the same picture.
     """
     for link in task.agent.robot.get_links():
         entities, meshes = [body.entity for body in link._objs], []  # one per scene

@@ -86,7 +86,7 @@ class Args:
     robot_triangles: int = 0 if CUDA else 500
     """triangles of each robot mesh, about; with 500 a CPU steps 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
-    """width and height of the camera's pictures, in pixels; MIKASA-Robo's have 128, at least 36"""
+    """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
     small: bool = False
@@ -99,7 +99,7 @@ class Args:
     repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
     """run directory of stage 1"""
     num_episodes: int = 2000
-    """random episodes of stage 1, made if they are missing, else the number that its dataset has"""
+    """random episodes of stage 1, made if they are missing; must be the number that its dataset has"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 2) are taken to be updates"""
     batch_episodes: int = 256
@@ -188,7 +188,7 @@ LIMITS |= dict(init_std=(0.001, math.inf), final_std=(0.001, math.inf))
 LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
 LIMITS |= dict(image_shift=(0, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
-TASKS = {  # Table 5; all other tasks get the defaults above, which are InterceptFast's and InterceptMedium's
+TASKS = {  # Table 5, where it differs from the defaults above
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
@@ -905,8 +905,8 @@ def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
 def decimate_meshes(task: gym.Env, triangles: int) -> None:
     """Draw the robot with about so many triangles per mesh and the ground with two; objects are drawn as they are.
 
-    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground has
-    20,000, between a square of vertices in a plane: its corners draw the same picture.
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground is
+    a flat grid of 20,000: its four corners draw the same picture.
     """
     for link in task.agent.robot.get_links():
         entities, meshes = [body.entity for body in link._objs], []  # one per scene

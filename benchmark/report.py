@@ -120,8 +120,9 @@ def belief_rows(folder: Path, setting: str) -> list[dict]:
             if not isinstance(values, list):
                 rows.append({**run, "step": "", "metric": metric, "value": f"{values:.3f}"})
                 continue
-            for step in sorted({4, 9, len(values) - 1, *range(0, len(values), 5)}):
-                rows.append({**run, "step": step, "metric": metric, "value": f"{values[step]:.3f}"})
+            for step, value in enumerate(values):
+                if step % 5 == 0 or step in (4, 9, len(values) - 1):
+                    rows.append({**run, "step": step, "metric": metric, "value": f"{value:.3f}"})
     return rows
 
 
@@ -214,7 +215,7 @@ def agents_table(table: str, evals: list[dict], tests: list[dict]) -> str:
 
 
 def pairs_table(evals: list[dict], tests: list[dict]) -> str:
-    """success_once of AIB and Believer of one task, setting and seed at equal steps, and the mean differences."""
+    """success_once of AIB and Believer of one task, setting and seed at equal steps, and mean differences."""
     rows, differences = [], ([], [])  # of evaluations, of test episodes
     for task, setting in rows_of("agents"):
         curves, tested = [], []
@@ -229,15 +230,21 @@ def pairs_table(evals: list[dict], tests: list[dict]) -> str:
                 pairs.append([agents[seed][1][-1] for agents in tested])
             row = [task.removesuffix("-v0"), setting, seed, f"{last:,.0f}"]
             for found, (aib, believer) in zip(differences, pairs, strict=False):
-                found.append(aib - believer)
+                found.append((task, aib - believer))
                 row += [f"{aib:.2f}", f"{believer:.2f}", f"{aib - believer:+.2f}"]
             rows.append(row + [""] * (10 - len(row)))
-    total = ["mean of the differences", "", "", ""]
-    for found in differences:
-        low, high = bootstrap_interval(found)
-        total += ["", "", f"{np.mean(found):+.2f} [{low:+.2f}, {high:+.2f}]"]
+    for kind in ("Remember", "Intercept", ""):
+        row = [f"mean, {kind or 'all'} tasks", "", "", ""]
+        for found in differences:
+            chosen = [difference for task, difference in found if task.startswith(kind)]
+            row += ["", "", f"{np.mean(chosen):+.2f}"]
+            if len(chosen) >= 6:
+                low, high = bootstrap_interval(chosen)
+                row[-1] += f" [{low:+.2f}, {high:+.2f}]"
+            row[-1] += f", {len(chosen)} pairs"
+        rows.append(row)
     head = ["task", "setting", "seed", "PPO steps", "evaluations: AIB", "Believer", "difference"]
-    return markdown([*head, "test: AIB", "Believer", "difference"], [*rows, total])
+    return markdown([*head, "test: AIB", "Believer", "difference"], rows)
 
 
 def belief_cell(beliefs: list[dict], metric: str, **chosen: str) -> str:
