@@ -170,6 +170,17 @@ def summarise(values: list[float]) -> str:
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} [{low:.2f}, {high:.2f}]"
 
 
+def mean_difference(values: list[float]) -> str:
+    """Mean, from six on with its 95 % bootstrap interval, and how many."""
+    if not values:
+        return ""
+    interval = ""
+    if len(values) >= 6:
+        low, high = bootstrap_interval(values)
+        interval = f" [{low:+.2f}, {high:+.2f}]"
+    return f"{np.mean(values):+.2f}{interval}, {len(values)} pairs"
+
+
 def markdown(head: list[str], rows: list[list[str]]) -> str:
     """A table."""
     lines = ["| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows]]
@@ -236,12 +247,7 @@ def pairs_table(evals: list[dict], tests: list[dict]) -> str:
     for kind in ("Remember", "Intercept", ""):
         row = [f"mean, {kind or 'all'} tasks", "", "", ""]
         for found in differences:
-            chosen = [difference for task, difference in found if task.startswith(kind)]
-            row += ["", "", f"{np.mean(chosen):+.2f}"]
-            if len(chosen) >= 6:
-                low, high = bootstrap_interval(chosen)
-                row[-1] += f" [{low:+.2f}, {high:+.2f}]"
-            row[-1] += f", {len(chosen)} pairs"
+            row += ["", "", mean_difference([difference for task, difference in found if task.startswith(kind)])]
         rows.append(row)
     head = ["task", "setting", "seed", "PPO steps", "evaluations: AIB", "Believer", "difference"]
     return markdown([*head, "test: AIB", "Believer", "difference"], rows)

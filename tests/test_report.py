@@ -72,7 +72,8 @@ def test_aib_and_believer_are_compared_at_equal_steps(monkeypatch: pytest.Monkey
     for method, seed, values in (("AIB", 1, [0.1, 0.3, 0.5, 0.7, 1.0]), ("Believer", 1, [0.2, 0.2, 0.2, 0.2])):
         rows += [(method, seed, step, value) for step, value in enumerate(values, 1)]
     rows += [("AIB", 2, 1, 0.5), ("Believer", 2, 1, 0.6), ("AIB", 3, 1, 0.9)]  # seed 3 has no partner
-    rows += [("AIB", 4, 1, 0.5), ("Believer", 4, 1, 0.5)]
+    for seed in range(4, 8):
+        rows += [("AIB", seed, 1, 0.5), ("Believer", seed, 1, 0.5)]
     evals = []
     for method, seed, step, value in rows:
         run = {"task": TASK, "method": method, "setting": "small", "seed": str(seed), "step": str(step)}
@@ -86,8 +87,9 @@ def test_aib_and_believer_are_compared_at_equal_steps(monkeypatch: pytest.Monkey
     # seed 1 at step 4: 0.3, 0.5, 0.7 against 0.2; without the end of the longer run, and without its test
     assert table[2] == "| RememberShapeAndColor3x2 | small | 1 | 4 | 0.50 | 0.20 | +0.30 |  |  |  |"
     assert table[3] == "| RememberShapeAndColor3x2 | small | 2 | 1 | 0.50 | 0.60 | -0.10 | 0.40 | 0.30 | +0.10 |"
-    assert table[5] == "| mean of the differences |  |  |  |  |  | +0.07 [-0.10, +0.30] |  |  | +0.05 [+0.00, +0.10] |"
-    assert len(table) == 6
+    assert table[8] == "| mean, Remember tasks |  |  |  |  |  | +0.03 [-0.05, +0.15], 6 pairs |  |  | +0.05, 2 pairs |"
+    assert table[9] == "| mean, Intercept tasks |  |  |  |  |  |  |  |  |  |"
+    assert table[10].startswith("| mean, all tasks |") and len(table) == 11
 
 
 def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
