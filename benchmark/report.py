@@ -280,6 +280,16 @@ def nearest_table(tests: list[dict]) -> str:
     return markdown(head, rows)
 
 
+def swapped_table(tests: list[dict]) -> str:
+    """success_once on test episodes of agents that see their own particles, or those of another episode."""
+    rows = []
+    for chosen, run, own in runs_of("swapped", METHODS.values(), tests, "success_once"):
+        chosen["setting"] += ", another episode's particles"
+        for seed, (_, swapped) in by_seed(tests, "success_once", **chosen).items():
+            rows.append([*run, seed, f"{own[seed][1][-1]:.2f}", f"{swapped[-1]:.2f}"])
+    return markdown(["task", "method", "setting", "seed", "own particles", "another episode's"], rows)
+
+
 def oracle_table(evals: list[dict]) -> str:
     """PPO without pictures on the privileged state, on u or on the target position: success_once of each seed.
 
@@ -393,7 +403,7 @@ def rebuild(output: Path) -> None:
     tables = {name: agents_table(name, evals, tests) for name in ("agents", "choices")}
     tables |= {"results": results_table(evals), "pairs": pairs_table(evals, tests)}
     tables |= {"oracle": oracle_table(evals), "shift": shift_table(evals, tests, beliefs)}
-    tables["nearest"] = nearest_table(tests)
+    tables |= {"nearest": nearest_table(tests), "swapped": swapped_table(tests)}
     tables["beliefs"] = beliefs_table(beliefs, "beliefs", ["AIB"], list(PROBES)[:5])
     tables["heads"] = beliefs_table(beliefs, "heads", list(HEADS.values()), list(PROBES)[3:6])
     for page in ("README.md", "docs/results.md"):
