@@ -21,7 +21,6 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +29,7 @@ import tyro
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from true_state import StateAgent  # noqa: E402
+import true_state  # noqa: E402
 
 import ppo_baseline  # noqa: E402
 from ppo_baseline import fail  # noqa: E402
@@ -52,47 +51,24 @@ class Args:
     """simulator processes"""
 
 
-class RandomGoal(gym.ObservationWrapper):
-    """Adds goal (3,) to the observation: the position of an object that is drawn by the episode's seed."""
+class ShowRandomObject(true_state.ShowState):
+    """Joints (25 + 3,) with the position of an object at their end, which the episode's seed draws."""
 
-    def __init__(self, env: gym.Env):
-        super().__init__(env)
-        task = env.unwrapped
-        self.objects = list((task.cubes if hasattr(task, "cubes") else task.shapes).values())
-        goal = gym.spaces.Box(-np.inf, np.inf, (3,))
-        self.observation_space = gym.spaces.Dict({**env.observation_space.spaces, "goal": goal})
-
-    def reset(self, *, seed: int, options: dict | None = None) -> tuple:
-        self.goal = self.objects[np.random.default_rng(seed).integers(len(self.objects))]
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
+        task = self.env.unwrapped
+        objects = list((task.cubes if hasattr(task, "cubes") else task.shapes).values())
+        self.goal = objects[np.random.default_rng(seed).integers(len(objects))]
         return super().reset(seed=seed, options=options)
 
-    def observation(self, obs: dict) -> dict:
-        return {**obs, "goal": self.goal.pose.p[0].numpy()}
+    def _show(self, obs: dict, info: dict) -> dict:
+        return {**obs, "joints": np.append(obs["joints"], self.goal.pose.p[0].numpy())}
 
 
-def make_envs(args: ppo_baseline.Args) -> gym.vector.VectorEnv:
+def make_envs(args: true_state.Args) -> gym.vector.VectorEnv:
     """args.num_workers processes of one scene each, all episodes of max_episode_steps, no auto-reset."""
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
-    workers = [lambda: RandomGoal(ppo_baseline.make_task(args, 1))] * args.num_workers
+    workers = [lambda: ShowRandomObject(ppo_baseline.make_task(args, 1), pictures=True)] * args.num_workers
     return gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
-
-
-def load_agent(args: Args) -> StateAgent:
-    """The agent of true_state.py --target."""
-    hint = "name an agent.pt of true_state.py --target with --agent"
-    file = Path(args.agent.format(**vars(args)))
-    weights = ppo_baseline.load(file, hint, kind="ppo_baseline agent", env_id=args.env_id)["agent"]
-    joints = gym.spaces.Box(-np.inf, np.inf, weights["joints_norm.running_mean"].shape)
-    if joints.shape != (25 + 3,):
-        fail(f"{file} sees other things than joints and a position; {hint}")
-    actions = gym.spaces.Box(-1, 1, weights["log_std"].shape)
-    spaces = SimpleNamespace(
-        single_observation_space={"rgb": gym.spaces.Box(0, 255, (1, 1, 3)), "joints": joints},
-        single_action_space=actions,
-    )
-    agent = StateAgent(spaces, ppo_baseline.Args())
-    agent.load_state_dict(weights)
-    return agent
 
 
 @torch.no_grad()
@@ -109,10 +85,15 @@ def main(args: Args) -> None:
     if stored["sim_backend"] != "physx_cpu":
         fail(f"{source} is of physx_cuda, which draws scenes by batch; only those of physx_cpu can be played again")
     task = {name: stored[name] for name in ("env_id", "robot_triangles", "image_size")}
-    settings = ppo_baseline.Args(**task)
-    settings.sim_backend, settings.num_workers = "physx_cpu", args.num_workers
+    settings = true_state.Args(**task, num_workers=args.num_workers)
     ppo_baseline.check_task(settings)
-    agent, envs = load_agent(args), make_envs(settings)
+    file, hint = Path(args.agent.format(**vars(args))), "name an agent.pt of true_state.py --target with --agent"
+    weights = ppo_baseline.load(file, hint, kind="ppo_baseline agent", env_id=args.env_id)["agent"]
+    if weights["joints_norm.running_mean"].shape != (25 + 3,):
+        fail(f"{file} sees other things than joints and a position; {hint}")
+    envs = make_envs(settings)
+    agent = true_state.StateAgent(envs, settings)
+    agent.load_state_dict(weights)
     part = path.with_name(path.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     shutil.copytree(source / "dataset", part / "dataset")
@@ -127,12 +108,11 @@ def main(args: Args) -> None:
         seeds = (args.seed * 1_000_000 + rows) % 2**29 + 2**30  # as in aib_repr.collect_random_episodes
         obs, info = envs.reset(seed=np.resize(seeds, envs.num_envs).tolist())
         for t in range(steps + 1):
-            for name, x in (("rgb", obs["rgb"]), ("joints", obs["joints"]), ("state", info["state"])):
+            for name, x in (("rgb", obs["rgb"]), ("joints", obs["joints"][:, :25]), ("state", info["state"])):
                 arrays[name][rows, t] = x[: len(rows)]
             if t == steps:
                 break
-            seen = torch.from_numpy(np.concatenate([obs["joints"], obs["goal"]], 1)).float()
-            actions = agent({"joints": seen})[0].sample().clamp(-1, 1).numpy()
+            actions = agent({"joints": torch.from_numpy(obs["joints"])})[0].sample().clamp(-1, 1).numpy()
             obs, rewards, _, _, info = envs.step(actions)
             for name, x in (("actions", actions), ("rewards", rewards), ("success", info["success"])):
                 arrays[name][rows, t] = x[: len(rows)]

@@ -76,14 +76,14 @@ class ShowState(gym.Wrapper):
 class StateAgent(nn.Module):
     """Actor and critic on joints and state, or u in its place, in the sizes of ppo_baseline.Agent.
 
-    With pictures (more than one pixel) also on those.
+    With args.pictures also on those.
     """
 
-    def __init__(self, envs: gym.vector.VectorEnv, args: ppo_baseline.Args, phi: StateEncoder | None = None):
+    def __init__(self, envs: gym.vector.VectorEnv, args: Args, phi: StateEncoder | None = None):
         super().__init__()
-        image_shape = envs.single_observation_space["rgb"].shape
-        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, args.amp)) if image_shape[0] > 1 else nn.Sequential()
-        (joints_dim,), (action_dim,) = envs.single_observation_space["joints"].shape, envs.single_action_space.shape
+        image_shape, (joints_dim,) = (envs.single_observation_space[name].shape for name in ("rgb", "joints"))
+        (action_dim,) = envs.single_action_space.shape
+        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, args.amp)) if args.pictures else nn.Sequential()
         self.phi = phi
         input_dim = 25 + phi(phi.mean).mean.numel() if phi else joints_dim
         self.joints_norm = nn.BatchNorm1d(joints_dim, affine=False, momentum=None).eval()
@@ -106,7 +106,7 @@ class StateAgent(nn.Module):
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
 
 
-def make_envs(args: ppo_baseline.Args) -> gym.vector.VectorEnv:
+def make_envs(args: Args) -> gym.vector.VectorEnv:
     """Up to args.num_workers processes of one scene each, all episodes of max_episode_steps, no auto-reset."""
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers
     count = min(args.num_workers, args.num_envs)

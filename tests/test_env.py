@@ -92,7 +92,7 @@ def test_the_batch_of_physx_cuda_is_played_and_recorded(
 def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.Env) -> None:
     shown = true_state.ShowState(env, pictures=True)
     obs, _ = shown.reset(seed=3)
-    agent = true_state.StateAgent(spaces([128, 128, 3], len(obs["joints"]), 8), ppo_baseline.Args())
+    agent = true_state.StateAgent(spaces([128, 128, 3], len(obs["joints"]), 8), true_state.Args(pictures=True))
     pictures = {"rgb": torch.from_numpy(np.stack([obs["rgb"], 255 - obs["rgb"]]))}
     _, value = agent({**pictures, "joints": torch.zeros(2, len(obs["joints"]))})
     assert value[0] != value[1], "it sees the picture"
@@ -101,7 +101,7 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
         assert obs in shown.observation_space and obs["rgb"].shape == (1, 1, 3)
         assert np.array_equal(obs["joints"][25:], info["state"]) and info["state"].any()
     shown_spaces = spaces([1, 1, 3], len(obs["joints"]), 8)
-    agent = true_state.StateAgent(shown_spaces, ppo_baseline.Args())
+    agent = true_state.StateAgent(shown_spaces, true_state.Args())
     joints = torch.from_numpy(np.stack([obs["joints"], obs["joints"]]))
     joints[1, -1] += 1
     policy, value = agent({"joints": joints})
@@ -110,7 +110,7 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
     value = agent({"joints": joints})[1]
     assert torch.allclose(value[0], value[1]), "inputs are clipped"
     phi = aib_belief.StateEncoder(len(info["state"]), 16)
-    agent = true_state.StateAgent(shown_spaces, ppo_baseline.Args(), phi)
+    agent = true_state.StateAgent(shown_spaces, true_state.Args(), phi)
     assert agent.joints[0].in_features == 25 + 16
     joints[:, -1] = torch.tensor([0.0, 1.0])
     first = agent({"joints": joints})[1]
