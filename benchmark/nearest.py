@@ -7,7 +7,6 @@ Usage:   python benchmark/nearest.py --checkpoint runs/RememberColor3-v0__ppo_ai
 Prints:  the evaluation with nearest_is_right in place of return; writes nothing
 """
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,15 +60,10 @@ def main(args: Args) -> None:
     if script is None or not stored["env_id"].startswith(("RememberColor", "RememberShape")):
         ppo_baseline.fail(f"{args.checkpoint} is no agent of a task of objects; name one with --checkpoint")
     make_task = script.make_task
-
-    def make_envs(settings: ppo_baseline.Args) -> gym.vector.VectorEnv:
-        os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
-        workers = [lambda: NearestObject(make_task(settings, 1))] * args.num_workers
-        return gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
-
-    script.make_envs, script.success_and_return = make_envs, nearest_and_success
+    script.make_task = lambda *arguments: NearestObject(make_task(*arguments))
+    script.success_and_return = nearest_and_success
     script.save = lambda path, content: None
-    settings = script.Args(checkpoint=str(args.checkpoint), sim_backend="physx_cpu")
+    settings = script.Args(checkpoint=str(args.checkpoint), sim_backend="physx_cpu", num_workers=args.num_workers)
     settings.num_eval_episodes = args.num_eval_episodes
     script.evaluate_checkpoint(settings)
 

@@ -22,7 +22,6 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import torch
 import tyro
@@ -64,13 +63,6 @@ class ShowRandomObject(true_state.ShowState):
         return {**obs, "joints": np.append(obs["joints"], self.goal.pose.p[0].numpy())}
 
 
-def make_envs(args: true_state.Args) -> gym.vector.VectorEnv:
-    """args.num_workers processes of one scene each, all episodes of max_episode_steps, no auto-reset."""
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
-    workers = [lambda: ShowRandomObject(ppo_baseline.make_task(args, 1), pictures=True)] * args.num_workers
-    return gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
-
-
 @torch.no_grad()
 def main(args: Args) -> None:
     """Copy the run of stage 1 and play every second scene of it anew; whole or not at all."""
@@ -91,7 +83,9 @@ def main(args: Args) -> None:
     weights = ppo_baseline.load(file, hint, kind="ppo_baseline agent", env_id=args.env_id)["agent"]
     if weights["joints_norm.running_mean"].shape != (25 + 3,):
         fail(f"{file} sees other things than joints and a position; {hint}")
-    envs = make_envs(settings)
+    make_task = ppo_baseline.make_task
+    ppo_baseline.make_task = lambda *arguments: ShowRandomObject(make_task(*arguments), pictures=True)
+    envs = ppo_baseline.make_envs(settings)
     agent = true_state.StateAgent(envs, settings)
     agent.load_state_dict(weights)
     part = path.with_name(path.name + ".part")

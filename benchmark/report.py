@@ -2,7 +2,7 @@
 
 Usage:   python benchmark/report.py                                  (README.md, docs/results.md and their figures)
          python benchmark/report.py --runs runs                      (learning curves and last values of your runs)
-         python benchmark/report.py --runs runs --add small    (append your runs to eval.csv, test.csv, beliefs.csv)
+         python benchmark/report.py --runs runs --add small    (add your runs to eval.csv, test.csv, beliefs.csv)
 Reads:   benchmark/results/: eval.csv, test.csv, beliefs.csv, nearest.csv, paper.csv, tables.csv (rows of tables);
          or runs/*/: args.json with eval.csv, evaluation.json (of --evaluate), diagnostics.json
 Writes:  tables between <!-- name --> and <!-- end --> in the pages, PNG figures; or benchmark/report/
@@ -50,7 +50,7 @@ class Args:
     runs: Path | None = None
     """report on this folder of run directories; none: rebuild README.md and docs/results.md"""
     add: str = ""
-    """append the runs to benchmark/results under this name of their setting, which settings.csv must have"""
+    """add the runs to benchmark/results under this name of their setting, which settings.csv must have"""
     output: Path = Path("benchmark/report")
     """where the report on --runs goes"""
 
@@ -105,7 +105,7 @@ def collect(folder: Path, setting: str = "") -> dict[str, pd.DataFrame]:
     for name, rows in found.items():
         columns = ["metric", "value"] if name == "beliefs.csv" else METRICS
         rows = pd.DataFrame(rows).rename(columns={"global_step": "step"})
-        tables[name] = rows.reindex(columns=KEY + columns).astype({"step": "Int64"})
+        tables[name] = rows.reindex(columns=KEY + columns).astype({"seed": "Int64", "step": "Int64"})
     return tables
 
 
@@ -434,8 +434,9 @@ def main(args: Args) -> None:
         if args.add not in [*read("settings.csv").setting]:
             fail(f"benchmark/results/settings.csv has no --add {args.add}; describe that setting there first")
         for name, rows in collect(args.runs, args.add).items():
-            digits = "%.3f" if name == "beliefs.csv" else "%.4f"
-            rows.to_csv(RESULTS / name, mode="a", header=False, index=False, float_format=digits)
+            key, digits = (KEY + ["metric"], 3) if name == "beliefs.csv" else (KEY, 4)
+            rows = pd.concat([read(name).astype({"step": "Int64"}), rows]).drop_duplicates(key, keep="last")
+            rows.to_csv(RESULTS / name, index=False, float_format=f"%.{digits}f")
     else:
         report_runs(args)
 

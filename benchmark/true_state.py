@@ -12,7 +12,6 @@ Writes:  runs/{env_id}__true_state__{seed}/ (true_u, true_target; …_pictures; 
 """
 
 import math
-import os
 import sys
 from dataclasses import dataclass
 from functools import partial
@@ -106,14 +105,6 @@ class StateAgent(nn.Module):
         return Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), self.critic(x).squeeze(-1)
 
 
-def make_envs(args: Args) -> gym.vector.VectorEnv:
-    """Up to args.num_workers processes of one scene each, all episodes of max_episode_steps, no auto-reset."""
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of the workers
-    count = min(args.num_workers, args.num_envs)
-    workers = [lambda: ShowState(ppo_baseline.make_task(args, 1), args.target, args.pictures)] * count
-    return gym.vector.AsyncVectorEnv(workers, context="spawn", autoreset_mode="Disabled")
-
-
 def load_phi(args: Args) -> StateEncoder:
     """Stage 1's state encoder from args.phi, frozen."""
     path = Path(args.phi.format(**vars(args))) / "repr.pt"
@@ -127,7 +118,9 @@ if __name__ == "__main__":
     ppo_baseline.Args = Args
     args = ppo_baseline.parse_args()
     phi = load_phi(args) if args.phi else None
-    ppo_baseline.Agent, ppo_baseline.make_envs = partial(StateAgent, phi=phi), make_envs
+    make_task = ppo_baseline.make_task
+    ppo_baseline.make_task = lambda *arguments: ShowState(make_task(*arguments), args.target, args.pictures)
+    ppo_baseline.Agent = partial(StateAgent, phi=phi)
     ppo_baseline.make_video = lambda data: b""
     name = "true_target" if args.target else "true_u" if phi else "true_state"
     if args.pictures:

@@ -108,6 +108,7 @@ def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.Monke
     assert report.read("eval.csv").empty
     (tmp_path / "settings.csv").write_text(head + "pink noise,,,--noise-beta 1,,\n")
     report.main(report.Args(runs=tmp_path, add="pink noise"))
+    report.main(report.Args(runs=tmp_path, add="pink noise"))  # a second time in place of the first
     rows = (tmp_path / "eval.csv").read_text().splitlines()[1:]
     assert rows == [
         f"{TASK},AIB,pink noise,3,{x},," for x in ("1000,0.2500,0.1250,3.5000", "2000,0.5000,0.2500,3.5000")
