@@ -298,14 +298,16 @@ def shift_table(evals: pd.DataFrame, tests: pd.DataFrame, beliefs: pd.DataFrame)
 # ---------------------------------------------------------------- figures
 
 
-def draw(axes: plt.Axes, curves: pd.DataFrame, label: str, colour: str | None) -> None:
+def draw(axes: plt.Axes, curves: pd.DataFrame, label: str, colour: str) -> None:
     """Mean over seeds at the steps all of them have, and each seed as a thin line."""
     if curves.empty:
         return
-    curves = curves.dropna()
-    (line,) = axes.plot(curves.index, curves.mean(axis="columns"), color=colour, label=label)
+    common = curves.dropna()
+    axes.plot(common.index, common.mean(axis="columns"), color=colour, label=label)
     if curves.shape[1] > 1:
-        axes.plot(curves.index, curves, color=line.get_color(), linewidth=0.8, alpha=0.4)
+        for _, curve in curves.items():
+            curve = curve.dropna()
+            axes.plot(curve.index, curve, color=colour, linewidth=0.8, alpha=0.4)
 
 
 def save_figure(figure: plt.Figure, axes: np.ndarray, path: Path) -> None:
@@ -315,24 +317,24 @@ def save_figure(figure: plt.Figure, axes: np.ndarray, path: Path) -> None:
         ax.grid(alpha=0.3)
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             entries[label] = handle
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries), frameon=False)
+    columns = max(1, int(10 * figure.get_figwidth()) // max(map(len, entries)))  # as many as fit below
+    columns = min(columns, len(entries))
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns, frameon=False)
     figure.savefig(path, dpi=100, metadata={"Software": None})
     plt.close(figure)
 
 
-def learning_curves(panels: dict[str, list[tuple]], path: Path, columns: int) -> None:
-    """success_once: by task the curves, their labels and colours; and chance."""
+def learning_curves(panels: list[tuple], path: Path, columns: int) -> None:
+    """success_once and chance, one panel for each of: task, title, curves with their labels and colours."""
     rows = math.ceil(len(panels) / columns)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(4 * columns, 3 * rows), layout="constrained", sharey=True, squeeze=False
-    )
-    for ax, (task, curves) in zip(axes.flat, panels.items(), strict=False):
+    size = (4 * columns, 3 * rows)
+    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", sharey=True, squeeze=False)
+    for ax, (task, title, curves) in zip(axes.flat, panels, strict=False):
         for curve, label, colour in curves:
             draw(ax, curve, label, colour)
         if task in CHANCE:
             ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
-        seeds = ", ".join(f"{curve.shape[1]} {label}" for curve, label, _ in curves)
-        ax.set_title(f"{task.removesuffix('-v0')}\nseeds: {seeds}", fontsize=9)
+        ax.set_title(title, fontsize=9)
         ax.set(xlabel="PPO steps", ylim=(-0.03, 1.03))  # curves at 0 beside the axis
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 100k
     for ax in axes[:, 0]:
@@ -376,12 +378,14 @@ def rebuild(output: Path) -> None:
         for name, table in tables.items():
             text = re.sub(rf"(<!-- {name} -->\n).*?(<!-- end -->)", rf"\g<1>{table}\n\g<2>", text, flags=re.DOTALL)
         (output / page).write_text(text)
-    panels = {}
+    panels = []
     for task, setting in rows_of("results"):
-        panels[task] = []
+        curves = []
         for method in METHODS.values():
-            curves = by_seed(evals, "success_once", task=task, method=method, setting=setting)
-            panels[task].append((curves, method, COLOURS[method]))
+            found = by_seed(evals, "success_once", task=task, method=method, setting=setting)
+            curves.append((found, method, COLOURS[method]))
+        seeds = ", ".join(f"{found.shape[1]} {method}" for found, method, _ in curves)
+        panels.append((task, f"{task.removesuffix('-v0')}\nseeds: {seeds}", curves))
     learning_curves(panels, output / "benchmark" / "results" / "learning_curves.png", columns=3)
     belief_figure(beliefs, output / "benchmark" / "results" / "beliefs.png")
 
@@ -415,15 +419,19 @@ def report_runs(args: Args) -> None:
     if evals.empty:
         fail(f"no eval.csv of a run without --quick below {args.runs}; name the folder of run directories with --runs")
     args.output.mkdir(parents=True, exist_ok=True)
-    panels, parts = {}, ["# Report"]
+    panels, parts = [], ["# Report"]
+    colours = {setting: f"C{i % 10}" for i, setting in enumerate(sorted(evals.setting.unique()))}
     for task, found in evals.groupby("task"):
-        panels[task] = [(by_seed(runs, "success_once"), setting, None) for setting, runs in found.groupby("setting")]
+        curves = []
+        for setting, runs in found.groupby("setting"):
+            curves.append((by_seed(runs, "success_once"), setting, colours[setting]))
+        panels.append((task, task, curves))
         parts.append(own_runs(evals, task))
     learning_curves(panels, args.output / "learning_curves.png", columns=len(panels))
     parts.append("![success_once](learning_curves.png)")
     parts += [own_beliefs(beliefs, task) for task in sorted(beliefs.task.unique())]
     (args.output / "report.md").write_text("\n\n".join(parts) + "\n")
-    print(f"{args.output / 'report.md'}: {', '.join(panels)}")
+    print(f"{args.output / 'report.md'}: {', '.join(task for task, *_ in panels)}")
 
 
 def main(args: Args) -> None:
