@@ -137,28 +137,17 @@ def runs_of(table: str, methods: Iterable[str], rows: pd.DataFrame, column: str)
                 yield chosen, chosen | {"task": task.removesuffix("-v0"), "seeds": ", ".join(map(str, curves))}, curves
 
 
-def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
-    """95 % bootstrap interval of the mean."""
-    return scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
-
-
-def summarise(values: pd.Series) -> str:
+def summarise(values: pd.Series, sign: str = "") -> str:
     """Mean (each seed); from six on mean ± sample standard deviation [95 % bootstrap interval of the mean]."""
-    if len(values) < 2:
-        return "".join(f"{value:z.2f}" for value in values)
+    if len(values) == 0:
+        return ""
+    mean = f"{np.mean(values):{sign}z.2f}"
+    if len(values) == 1:
+        return mean
     if len(values) < 6:
-        return f"{np.mean(values):z.2f} ({', '.join(f'{value:z.2f}' for value in values)})"
-    low, high = bootstrap_interval(values)
-    return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} [{low:.2f}, {high:.2f}]"
-
-
-def mean_difference(values: pd.Series) -> str:
-    """Mean, from six on with its 95 % bootstrap interval, and how many."""
-    interval = ""
-    if len(values) >= 6:
-        low, high = bootstrap_interval(values)
-        interval = f" [{low:+.2f}, {high:+.2f}]"
-    return f"{values.mean():+.2f}{interval}, {len(values)} pairs" if len(values) else ""
+        return f"{mean} ({', '.join(f'{value:{sign}z.2f}' for value in values)})"
+    low, high = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    return f"{mean} ± {np.std(values, ddof=1):.2f} [{low:{sign}.2f}, {high:{sign}.2f}]"
 
 
 def markdown(rows: list[dict]) -> str:
@@ -228,7 +217,8 @@ def pairs_table(evals: pd.DataFrame, tests: pd.DataFrame) -> str:
         row = {"task": f"mean, {kind or 'all'} tasks"}
         for prefix in ("", "test: "):
             found = select(differences, prefix=prefix)
-            row[f"{prefix}difference"] = mean_difference(found[found.task.str.startswith(kind)].value)
+            values = found[found.task.str.startswith(kind)].value
+            row[f"{prefix}difference"] = summarise(values, "+") + (f", {len(values)} pairs" if len(values) else "")
         rows.append(row)
     return markdown(rows)
 

@@ -109,15 +109,24 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
     assert json.dumps(metrics, indent=2) in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
-def test_nearest_evaluates_an_agent_and_writes_nothing(quick_runs: Path) -> None:
-    path = quick_runs / f"{TASK}__ppo_baseline_quick__1"
-    before = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
-    options = ["--num-eval-episodes", "3", "--num-workers", "2"]
-    code, out, err = run("benchmark/nearest", "--checkpoint", str(path / "agent.pt"), *options, cwd=quick_runs.parent)
-    assert code == 0 and 0 <= json.loads(out[out.index("{") :])["nearest_is_right"] <= 1, err
-    assert before == {file: file.stat().st_mtime_ns for file in path.rglob("*")}
-    code, _, err = run("benchmark/nearest", "--checkpoint", str(path / "checkpoint.pt"), cwd=quick_runs.parent)
-    assert code == 2 and "is no agent of a task of objects" in err
+def test_an_agent_is_diagnosed_and_nothing_is_written(quick_runs: Path) -> None:
+    def diagnose(run_name: str, *options: str, file: str = "agent.pt") -> tuple[int, str, str]:
+        checkpoint = ["--checkpoint", f"runs/{TASK}__{run_name}_quick__1/{file}"]
+        return run("benchmark/diagnose_agent", *checkpoint, *options, cwd=quick_runs.parent)
+
+    before = {file: file.stat().st_mtime_ns for file in quick_runs.rglob("*")}
+    found = []
+    for options in ([], ["--swap-particles"]):
+        code, out, err = diagnose("ppo_aib", "--num-eval-episodes", "3", "--num-workers", "2", *options)
+        assert code == 0, err
+        found.append(json.loads(out[out.index("{") :]))
+        assert 0 <= found[-1]["nearest_is_right"] <= 1
+    assert found[0]["u_r2"] != found[1]["u_r2"], "other particles, other actions, other states"
+    assert before == {file: file.stat().st_mtime_ns for file in quick_runs.rglob("*")}
+    code, _, err = diagnose("ppo_aib", file="checkpoint.pt")
+    assert code == 2 and "is no agent" in err
+    code, _, err = diagnose("ppo_baseline", "--swap-particles")
+    assert code == 2 and "needs an agent with a belief" in err
 
 
 def test_reach_plays_every_second_scene_anew_and_stage_2_takes_it(

@@ -18,7 +18,7 @@ import ppo_baseline
 from conftest import ROOT, TASK, spaces
 
 sys.path.append(str(ROOT / "benchmark"))
-import nearest  # noqa: E402
+import diagnose_agent  # noqa: E402
 import true_state  # noqa: E402
 
 # RememberColor9's nine colours have six hues on the screen: maroon is a dark red, olive reads as yellow, teal as cyan
@@ -129,7 +129,7 @@ def test_the_true_state_stands_behind_the_joints_and_nothing_is_drawn(env: gym.E
 
 
 def test_nearest_object_tells_the_right_one(env: gym.Env) -> None:
-    task, told = env.unwrapped, nearest.NearestObject(env)
+    task, told = env.unwrapped, diagnose_agent.NearestObject(env)
     _, info = told.reset(seed=5)
     right = int(info["cue"][0])
     for _ in range(12):  # until the objects stand on the table
@@ -142,7 +142,7 @@ def test_nearest_object_tells_the_right_one(env: gym.Env) -> None:
         assert told.step(np.zeros(8, np.float32))[1] == (key == right)
     buffer = {"rewards": torch.tensor([[1.0, 1.0], [0.0, 1.0]]), "success": torch.tensor([[1.0, 0.0], [0.0, 0.0]])}
     metrics = {"nearest_is_right": 0.5, "success_once": 0.5, "success_at_end": 0.0}
-    assert nearest.nearest_and_success(buffer) == metrics
+    assert diagnose_agent.nearest_and_success(buffer) == metrics
 
 
 def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:

@@ -1,9 +1,10 @@
-"""Memory or reach? How often an agent's hand ends nearest to the right object, on the test episodes of --evaluate.
+"""Does an agent fail for want of memory or of skill? The test episodes of --evaluate, with more to tell.
 
-A success asks for both: a hand at rest within 5 cm of the right object. Which object is nearest at the last step tells
-what the agent took for the right one, however well it reached.
+nearest_is_right, on Remember tasks: how often the hand ends nearest to the right object. A success asks for more, a
+hand at rest within 5 cm of it. With --swap-particles each episode shows the particles of another one, so that an agent
+loses what it owes to its belief.
 
-Usage:   python benchmark/nearest.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
+Usage:   python benchmark/diagnose_agent.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
 Prints:  the evaluation with nearest_is_right in place of return; writes nothing
 """
 
@@ -25,22 +26,25 @@ import ppo_believer  # noqa: E402
 @dataclass
 class Args:
     checkpoint: Path
-    """agent.pt of one of the PPO scripts, on a RememberColor, RememberShape or RememberShapeAndColor task"""
+    """agent.pt of one of the PPO scripts"""
+    swap_particles: bool = False
+    """show the particles of another episode"""
     num_eval_episodes: int = 256
     """episodes, the first of --evaluate's"""
     num_workers: int = ppo_baseline.Args.num_workers
-    """simulator processes"""
+    """simulator processes; episodes played at the same time swap their particles, so at least 2"""
 
 
 class NearestObject(gym.Wrapper):
-    """The reward is 1 where no object is nearer to the hand than the right one, else 0."""
+    """The reward is 1 where no object is nearer to the hand than the right one, else 0; nan without objects."""
 
     def step(self, action: np.ndarray) -> tuple:
         obs, _, *others = self.env.step(action)
         task = self.env.unwrapped
-        objects = task.cubes if hasattr(task, "cubes") else task.shapes
+        objects = getattr(task, "cubes", None) or getattr(task, "shapes", {})
         distances = [(x.pose.p - task.agent.tcp.pose.p).norm().item() for x in objects.values()]
-        return obs, float(task.obj_to_goal_pos.norm().item() <= min(distances) + 1e-4), *others
+        nearest = float(task.obj_to_goal_pos.norm().item() <= min(distances) + 1e-4) if objects else float("nan")
+        return obs, nearest, *others
 
 
 def nearest_and_success(buffer: dict[str, Tensor]) -> dict[str, float]:
@@ -54,12 +58,16 @@ def nearest_and_success(buffer: dict[str, Tensor]) -> dict[str, float]:
 
 def main(args: Args) -> None:
     """Evaluate the agent with other metrics."""
-    stored = ppo_baseline.load(args.checkpoint, "name an agent.pt with --checkpoint")
+    kind = ppo_baseline.load(args.checkpoint, "name an agent.pt with --checkpoint")["kind"]
     scripts = {f"{script.__name__} agent": script for script in (ppo_aib, ppo_believer, ppo_baseline)}
-    script = scripts.get(stored["kind"])
-    if script is None or not stored["env_id"].startswith(("RememberColor", "RememberShape")):
-        ppo_baseline.fail(f"{args.checkpoint} is no agent of a task of objects; name one with --checkpoint")
-    make_task = script.make_task
+    if kind not in scripts:
+        ppo_baseline.fail(f"{args.checkpoint} is no agent; name an agent.pt with --checkpoint")
+    script = scripts[kind]
+    if args.swap_particles and (script is ppo_baseline or args.num_workers < 2):
+        ppo_baseline.fail("--swap-particles needs an agent with a belief, and --num-workers of at least 2")
+    forward, make_task = script.Agent.forward, script.make_task
+    if args.swap_particles:
+        script.Agent.forward = lambda agent, obs: forward(agent, {**obs, "particles": obs["particles"].roll(1, 0)})
     script.make_task = lambda *arguments: NearestObject(make_task(*arguments))
     script.success_and_return = nearest_and_success
     script.save = lambda path, content: None
