@@ -40,7 +40,8 @@ def main(args: ppo_believer.Args) -> None:
     fit_on, test_on = np.split(held_out, [len(held_out) - len(held_out) // 2])  # as in aib_belief.main
     fit, test = (aib_belief.encode(belief, posterior, episodes, index) for index in (fit_on, test_on))
     ppo_believer.save(path / "diagnostics.json", json.dumps(aib_belief.probe_belief(fit, test), indent=2).encode())
-    print(report.own_beliefs(report.collect(Path("runs"))["beliefs.csv"], args.env_id))
+    beliefs = report.select(report.collect(Path("runs"))["beliefs.csv"], task=args.env_id)
+    print(report.beliefs_table(beliefs, [(args.env_id, setting) for setting in beliefs.setting.unique()]))
 
 
 if __name__ == "__main__":

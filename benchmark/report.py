@@ -127,9 +127,11 @@ def last(curves: pd.DataFrame, count: int = 1) -> pd.Series:
     return pd.Series({seed: curve.dropna()[-count:].mean() for seed, curve in curves.items()}, dtype=float)
 
 
-def runs_of(table: str, methods: Iterable[str], rows: pd.DataFrame, column: str) -> Iterator[tuple]:
-    """What selects the runs of each row of a table and each method that has some; its cells; the column by seed."""
-    for task, setting in rows_of(table):
+def runs_of(
+    settings: list[tuple[str, str]], methods: Iterable[str], rows: pd.DataFrame, column: str
+) -> Iterator[tuple]:
+    """What selects the runs of each task, setting and method that has some; its cells; the column by seed."""
+    for task, setting in settings:
         for method in methods:
             chosen = {"task": task, "method": method, "setting": setting}
             curves = by_seed(rows, column, **chosen)
@@ -180,7 +182,7 @@ def agents_table(table: str, evals: pd.DataFrame, tests: pd.DataFrame) -> str:
     """Agents with pictures: success_once and success_at_end; the last agents' on test episodes."""
     before = read("settings.csv").set_index("setting").steps_before_ppo
     rows = []
-    for chosen, row, curves in runs_of(table, METHODS.values(), evals, "success_once"):
+    for chosen, row, curves in runs_of(rows_of(table), METHODS.values(), evals, "success_once"):
         row["steps before"] = f"{0 if chosen['method'] == 'PPO' else before[chosen['setting']]:,.0f}"
         row["PPO steps"] = f"{min(curve.last_valid_index() for _, curve in curves.items()):,}"
         for metric in METRICS[:2]:
@@ -229,10 +231,10 @@ def belief_cell(beliefs: pd.DataFrame, metric: str, **chosen: object) -> str:
     return summarise(values[:1] if metric == "cue_chance" else values)
 
 
-def beliefs_table(beliefs: pd.DataFrame, table: str, methods: Iterable[str], metrics: list[str]) -> str:
+def beliefs_table(beliefs: pd.DataFrame, settings: list[tuple[str, str]], metrics: Iterable[str] = PROBES) -> str:
     """What beliefs know at the last step of held-out episodes; in one setting all methods have the same ones and u."""
     rows = []
-    for chosen, row, _ in runs_of(table, methods, select(beliefs, metric="u_r2_prior"), "value"):
+    for chosen, row, _ in runs_of(settings, HEADS.values(), select(beliefs, metric="u_r2_prior"), "value"):
         found = select(beliefs, **chosen)
         rows.append(row | {PROBES[metric]: belief_cell(found, metric) for metric in metrics})
     return markdown(rows)
@@ -242,7 +244,7 @@ def tested_table(tests: pd.DataFrame) -> str:
     """On the 256 test episodes: success, where the hand ends, and success with another episode's particles."""
     nearest = read("nearest.csv")
     rows = []
-    for chosen, row, curves in runs_of("tested", METHODS.values(), tests, "success_once"):
+    for chosen, row, curves in runs_of(rows_of("tested"), METHODS.values(), tests, "success_once"):
         for seed in curves:
             run = chosen | {"seed": seed}
             cells = {metric: summarise(last(by_seed(tests, metric, **run))) for metric in METRICS[:2]}
@@ -260,7 +262,7 @@ def oracle_table(evals: pd.DataFrame) -> str:
     The last evaluation until each step.
     """
     rows = []
-    for _, row, curves in runs_of("oracle", ORACLES.values(), evals, "success_once"):
+    for _, row, curves in runs_of(rows_of("oracle"), ORACLES.values(), evals, "success_once"):
         for step in ORACLE_STEPS:
             reached = [
                 curve.loc[:step].iloc[-1] for _, curve in curves.items() if curve.last_valid_index() > 0.95 * step
@@ -273,7 +275,7 @@ def oracle_table(evals: pd.DataFrame) -> str:
 def shift_table(evals: pd.DataFrame, tests: pd.DataFrame, beliefs: pd.DataFrame) -> str:
     """R² of u at the last step: held-out episodes; the agent's in its first and last evaluation; test episodes."""
     rows = []
-    for chosen, row, curves in runs_of("agents", METHODS.values(), evals, "u_r2_at_end"):
+    for chosen, row, curves in runs_of(rows_of("agents"), METHODS.values(), evals, "u_r2_at_end"):
         success = last(by_seed(evals, "success_once", **chosen))
         for seed, curve in curves.items():
             known = curve.dropna()
@@ -361,8 +363,8 @@ def rebuild(output: Path) -> None:
     tables |= {"results": results_table(evals), "pairs": pairs_table(evals, tests)}
     tables |= {"oracle": oracle_table(evals), "shift": shift_table(evals, tests, beliefs)}
     tables["tested"] = tested_table(tests)
-    tables["beliefs"] = beliefs_table(beliefs, "beliefs", ["AIB"], list(PROBES)[:5])
-    tables["heads"] = beliefs_table(beliefs, "heads", HEADS.values(), list(PROBES)[3:6])
+    tables["beliefs"] = beliefs_table(select(beliefs, method="AIB"), rows_of("beliefs"), list(PROBES)[:5])
+    tables["heads"] = beliefs_table(beliefs, rows_of("heads"), list(PROBES)[3:6])
     for page in ("README.md", "docs/results.md"):
         text = (ROOT / page).read_text()
         for name, table in tables.items():
@@ -378,14 +380,6 @@ def rebuild(output: Path) -> None:
         panels.append((task, f"{task.removesuffix('-v0')}\nseeds: {seeds}", curves))
     learning_curves(panels, output / "benchmark" / "results" / "learning_curves.png", columns=3)
     belief_figure(beliefs, output / "benchmark" / "results" / "beliefs.png")
-
-
-def own_beliefs(beliefs: pd.DataFrame, task: str) -> str:
-    """The beliefs of one task by setting (exp_name): metrics at the last time step of held-out random episodes."""
-    rows = []
-    for setting, found in select(beliefs, task=task).groupby("setting"):
-        rows.append({task: setting} | {label: belief_cell(found, metric) for metric, label in PROBES.items()})
-    return markdown(rows)
 
 
 def own_runs(evals: pd.DataFrame, task: str) -> str:
@@ -419,7 +413,8 @@ def report_runs(args: Args) -> None:
         parts.append(own_runs(evals, task))
     learning_curves(panels, args.output / "learning_curves.png", columns=len(panels))
     parts.append("![success_once](learning_curves.png)")
-    parts += [own_beliefs(beliefs, task) for task in sorted(beliefs.task.unique())]
+    if not beliefs.empty:
+        parts.append(beliefs_table(beliefs, sorted({*zip(beliefs.task, beliefs.setting, strict=True)})))
     (args.output / "report.md").write_text("\n\n".join(parts) + "\n")
     print(f"{args.output / 'report.md'}: {', '.join(task for task, *_ in panels)}")
 

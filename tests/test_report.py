@@ -53,7 +53,7 @@ def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     assert "| success_once | ppo_baseline, 3,000 steps | 0.13 | 0.30 |" in text
     assert "| success_once | published_ppo, 1,000 steps | 0.25 | 0.25 |" in text
     assert "| success_once | AIB, the paper's | 0.82 ± 0.04 | 0.87 ± 0.01 |" in text
-    assert "| aib_belief |  |  | 0.90 | 0.50 | 0.25 | 0.50 | -3.00 | -4.00 |  |" in text
+    assert "| AIB, no head | aib_belief | 1 |  |  | 0.90 | 0.50 | 0.25 | 0.50 | -3.00 | -4.00 |  |" in text
     assert "quick" not in text
     assert iio.imread(tmp_path / "report" / "learning_curves.png").std() > 10
 
