@@ -70,9 +70,9 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
     small: bool = False
-    """a reduced setting for a CPU and half an hour; tuned on RememberColor3-v0, seed 1"""
+    """a reduced setting for a CPU, half an hour for all stages; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -202,7 +202,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has past actions, too: left out, as AIB's action head is to infer a_t and not to copy it.
+    The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which the head is to infer.
     """
 
     def __init__(self, config: dict, amp: bool = False):

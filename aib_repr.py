@@ -1,7 +1,7 @@
 """AIB stage 1: a random-policy dataset and a compact encoder of the privileged state (paper section 3.1, Algorithm 1).
 
-phi(s) is trained with psi(o) to predict reward and next latents. A KL penalty leaves in u = phi(s) what helps to
-predict and is not in o. Only phi is kept, and the means and standard deviations of images and joints.
+phi(s) is trained with psi(o) to predict reward and next latents. A KL penalty removes from u = phi(s) what does
+not help to predict, or is seen in o, too. Kept are only phi and the means and deviations of images and joints.
 
 Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events; args.json and checkpoint.pt to
@@ -75,13 +75,13 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
     small: bool = False
-    """a reduced setting for a CPU and half an hour; tuned on RememberColor3-v0, seed 1"""
+    """a reduced setting for a CPU, half an hour for all stages; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
-    """delete what the run directory holds and start again; to resume, leave it out"""
+    """delete what the run directory holds, the episodes too, and start again; to resume, leave it out"""
 
     num_envs: int = 50
     """at most this many scenes at a time; physx_cuda draws one arm pose for all of them"""
@@ -272,7 +272,7 @@ def random_actions(args: Args, episode: int, steps: int, action_dim: int) -> np.
 
 
 def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
-    """Fill dataset/ from where it stopped with N whole episodes of the uniformly random policy; its memory maps:
+    """Play N whole episodes with uniformly random actions into dataset/, from where it stopped. Returns its arrays:
 
     rgb (N, T+1, H, W, 3) uint8; joints, state (N, T+1, .); actions (N, T, A); rewards, success (N, T); cue, the memory
     variable (N, K).
@@ -437,7 +437,7 @@ def main(args: Args) -> None:
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
-    """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
+    """Observation and privileged info of a task that was made with obs_mode state_dict; _view adds the picture.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
     Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all that the task's _get_obs_extra

@@ -76,9 +76,9 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. It changes episodes by rounding only"""
+    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
     small: bool = False
-    """a reduced setting for a CPU and half an hour; tuned on RememberColor3-v0, seed 1"""
+    """a reduced setting for a CPU, half an hour for all stages; tuned on RememberColor3-v0, seed 1"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -87,7 +87,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training; a finished run goes on with a larger number"""
     num_envs: int = 256
-    """episodes per iteration; on physx_cuda one arm pose is drawn for all of them"""
+    """episodes per iteration; on physx_cuda all begin with one arm pose, in evaluations too"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
     cnn_lr_scale: float = 1.0
@@ -138,7 +138,7 @@ LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
 LIMITS |= dict(init_std=(0.001, math.inf), final_std=(0.001, math.inf))
 LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
-TASKS = {  # Table 5, where it differs from the defaults above
+TASKS = {  # Table 5, where it differs from the defaults above; any other task has InterceptFast-v0's, the defaults
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
@@ -463,7 +463,7 @@ def main(args: Args) -> None:
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
-    """Observation and privileged info of a task in obs_mode state_dict, which has no pictures: _view adds them.
+    """Observation and privileged info of a task that was made with obs_mode state_dict; _view adds the picture.
 
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
     Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all that the task's _get_obs_extra

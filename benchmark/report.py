@@ -197,30 +197,34 @@ def agents_table(table: str, evals: pd.DataFrame, tests: pd.DataFrame) -> str:
 
 
 def pairs_table(evals: pd.DataFrame, tests: pd.DataFrame) -> str:
-    """success_once of AIB and Believer of one task, setting and seed at equal steps, and mean differences."""
-    methods, rows, differences = ["AIB", "Believer"], [], []
+    """success_once of AIB and Believer of one task, setting and seed at equal steps; differences, at the end too."""
+    rows, differences = [], []
     for task, setting in rows_of("agents"):
         for seed, run in select(evals, task=task, setting=setting).groupby("seed"):
-            curves = run.pivot(index="step", columns="method", values="success_once")
-            if not {*methods} <= {*curves}:
+            steps = run.groupby("method").step.max().reindex(["AIB", "Believer"]).min(skipna=False)
+            if math.isnan(steps):
                 continue
-            steps = min(curves[method].last_valid_index() for method in methods)
-            row = {"task": task.removesuffix("-v0"), "setting": setting, "seed": seed, "PPO steps": f"{steps:,}"}
-            tested = select(tests, task=task, setting=setting, seed=seed, step=steps).set_index("method").success_once
-            for prefix, pair in (("", last(curves.loc[:steps], 3)), ("test: ", tested)):
-                if {*methods} <= {*pair.index}:
+            row = {"task": task.removesuffix("-v0"), "setting": setting, "seed": seed, "PPO steps": f"{steps:,.0f}"}
+            found = {
+                "": run[run.step <= steps],
+                "test: ": select(tests, task=task, setting=setting, seed=seed, step=steps),
+            }
+            for prefix, values in found.items():
+                for metric, column in (("success_once", "difference"), ("success_at_end", "at end")):
+                    pair = last(values.pivot(index="step", columns="method", values=metric), 3)
+                    if not {"AIB", "Believer"} <= {*pair.index}:
+                        continue
+                    if metric == "success_once":
+                        row |= {f"{prefix}{method}": f"{pair[method]:.2f}" for method in ("AIB", "Believer")}
                     difference = pair["AIB"] - pair["Believer"]
-                    differences.append({"task": task, "prefix": prefix, "value": difference})
-                    row |= {f"{prefix}{method}": f"{pair[method]:.2f}" for method in methods}
-                    row[f"{prefix}difference"] = f"{difference:+.2f}"
+                    row[prefix + column] = f"{difference:+.2f}"
+                    differences.append({"task": task, "column": prefix + column, "value": difference})
             rows.append(row)
     differences = pd.DataFrame(differences)
-    for kind in ("Remember", "Intercept", ""):
-        row = {"task": f"mean, {kind or 'all'} tasks"}
-        for prefix in ("", "test: "):
-            found = select(differences, prefix=prefix)
-            values = found[found.task.str.startswith(kind)].value
-            row[f"{prefix}difference"] = summarise(values, "+") + (f", {len(values)} pairs" if len(values) else "")
+    for kind in ("Remember", "Intercept"):
+        row = {"task": f"mean, {kind} tasks"}
+        for column, found in differences[differences.task.str.startswith(kind)].groupby("column"):
+            row[column] = f"{summarise(found.value, '+')}, {len(found)} pairs"
         rows.append(row)
     return markdown(rows)
 
@@ -363,8 +367,8 @@ def rebuild(output: Path) -> None:
     tables |= {"results": results_table(evals), "pairs": pairs_table(evals, tests)}
     tables |= {"oracle": oracle_table(evals), "shift": shift_table(evals, tests, beliefs)}
     tables["tested"] = tested_table(tests)
-    tables["beliefs"] = beliefs_table(select(beliefs, method="AIB"), rows_of("beliefs"), list(PROBES)[:5])
-    tables["heads"] = beliefs_table(beliefs, rows_of("heads"), list(PROBES)[3:6])
+    tables["beliefs"] = beliefs_table(select(beliefs, method="AIB"), rows_of("beliefs"), [*PROBES][:5] + [*PROBES][6:8])
+    tables["heads"] = beliefs_table(beliefs, rows_of("heads"), [*PROBES][3:6])
     for page in ("README.md", "docs/results.md"):
         text = (ROOT / page).read_text()
         for name, table in tables.items():

@@ -77,20 +77,24 @@ def test_aib_and_believer_are_compared_at_equal_steps(monkeypatch: pytest.Monkey
     evals = []
     for method, seed, step, value in rows:
         run = {"task": TASK, "method": method, "setting": "small", "seed": seed, "step": step}
-        evals.append({**run, "success_once": value})
+        evals.append({**run, "success_once": value, "success_at_end": value / 2})
     tests = []
     found = [("AIB", 1, 5, 0.9), ("Believer", 1, 4, 0.1), ("AIB", 2, 1, 0.4), ("Believer", 2, 1, 0.3)]
     for method, seed, step, value in [*found, ("AIB", 4, 1, 0.5), ("Believer", 4, 1, 0.5)]:
         run = {"task": TASK, "method": method, "setting": "small", "seed": seed, "step": step}
-        tests.append({**run, "success_once": value})
+        tests.append({**run, "success_once": value, "success_at_end": value / 2})
     table = report.pairs_table(pd.DataFrame(evals), pd.DataFrame(tests)).splitlines()
     # seed 1 at step 4: 0.3, 0.5, 0.7 against 0.2; without the end of the longer run, and without its test
-    assert table[2] == "| RememberShapeAndColor3x2 | small | 1 | 4 | 0.50 | 0.20 | +0.30 |  |  |  |"
-    assert table[3] == "| RememberShapeAndColor3x2 | small | 2 | 1 | 0.50 | 0.60 | -0.10 | 0.40 | 0.30 | +0.10 |"
-    means = ["+0.03 ± 0.14 [-0.05, +0.15], 6 pairs", "+0.05 (+0.10, +0.00), 2 pairs"]
-    assert table[8] == f"| mean, Remember tasks |  |  |  |  |  | {means[0]} |  |  | {means[1]} |"
-    assert table[9] == "| mean, Intercept tasks |  |  |  |  |  |  |  |  |  |"
-    assert table[10].startswith("| mean, all tasks |") and len(table) == 11
+    task = "| RememberShapeAndColor3x2 | small"
+    assert table[2] == f"{task} | 1 | 4 | 0.50 | 0.20 | +0.30 | +0.15 |  |  |  |  |"
+    assert table[3] == f"{task} | 2 | 1 | 0.50 | 0.60 | -0.10 | -0.05 | 0.40 | 0.30 | +0.10 | +0.05 |"
+    means = ["+0.03 ± 0.14 [-0.05, +0.15], 6 pairs", "+0.02 ± 0.07 [-0.02, +0.07], 6 pairs"]
+    tested = ["+0.05 (+0.10, +0.00), 2 pairs", "+0.03 (+0.05, +0.00), 2 pairs"]
+    assert (
+        table[8]
+        == f"| mean, Remember tasks |  |  |  |  |  | {means[0]} | {means[1]} |  |  | {tested[0]} | {tested[1]} |"
+    )
+    assert table[9].startswith("| mean, Intercept tasks |") and len(table) == 10
 
 
 def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
