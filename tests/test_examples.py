@@ -73,6 +73,16 @@ def test_a_task_that_breaks_the_contract_is_told_how(message: str, spoil: Callab
         check_task_class(Broken)
 
 
+def test_actions_that_would_be_clipped_and_shared_observations_are_told() -> None:
+    class Broken(RememberTarget):
+        action_space = gym.spaces.Box(-2, 2, (2,), np.float32)
+
+    with pytest.raises(AssertionError, match="actions must lie in"):
+        check_task_class(Broken)
+    with pytest.raises(AssertionError, match="rgb of the reset was overwritten"):
+        check_task_class(RememberTarget, copy=False)
+
+
 def test_an_episode_that_ends_early_is_told_when() -> None:
     class Broken(RememberTarget):
         def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
@@ -99,10 +109,11 @@ def test_an_observation_of_the_wrong_type_is_told(name: str, space: gym.Space, m
         check_task_class(Broken)
 
 
-def check_task_class(task: type[gym.Env]) -> None:
+def check_task_class(task: type[gym.Env], **vector_kwargs: bool) -> None:
     """check_envs on two environments of a task of 20 steps."""
     gym.register("Checked-v0", task, max_episode_steps=20)
+    vector_kwargs["autoreset_mode"] = "Disabled"
     try:
-        check_envs(gym.make_vec("Checked-v0", 2, "sync", vector_kwargs={"autoreset_mode": "Disabled"}), "Checked-v0")
+        check_envs(gym.make_vec("Checked-v0", 2, "sync", vector_kwargs=vector_kwargs), "Checked-v0")
     finally:
         gym.registry.pop("Checked-v0")
