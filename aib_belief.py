@@ -130,7 +130,7 @@ QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 
 
 # ---------------------------------------------------------------- networks
-# HistoryEncoder and AIBBelief are the same in aib_belief.py and ppo_aib.py, which loads the former's weights
+# HistoryEncoder (also ppo_believer.py's) and AIBBelief are the same in aib_belief.py and ppo_aib.py, for the weights
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:
@@ -202,7 +202,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which the head is to infer.
+    The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -288,7 +288,7 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int
 
 
 def elbo_terms(belief: nn.Module, posterior: nn.Module, u: Tensor, h: Tensor) -> tuple[Tensor, ...]:
-    """Terms of -L_VAE at each step (...,): -log p(u|z,h) and KL(q || p); then z ~ q and the mean of q (..., z_dim)."""
+    """u (..., u_dim), h (..., 256) -> -L_VAE's -log p(u|z,h) and KL(q || p) (...,); z ~ q and q's mean (..., z_dim)."""
     q = posterior(torch.cat([u, h], -1))
     z = q.rsample()
     nll = -belief.decoder(torch.cat([z, h], -1)).log_prob(u).sum(-1)
@@ -308,7 +308,7 @@ def flow_matching_loss(
 
 
 def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
-    """L_Total = -L_VAE (KL weighted by beta) + lambda L_FM, and its terms, means over all steps of whole episodes.
+    """L_Total = -L_VAE (KL weighted by beta) + lambda L_FM, and its terms, means over EpisodeDataset's batch.
 
     L_FM gets the means of q, with args.fm_latent sample its samples, as in the paper. With args.action_head mse, the
     squared error of the actions stands in L_FM's place.
@@ -333,7 +333,7 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
 
 
 class EpisodeDataset:
-    """Whole episodes of dataset/ with u, time first; images on the GPU where they fit in half of its free memory."""
+    """dataset/ and u (N, T+1, u_dim) by whole episodes, time first; images on the GPU if half its memory holds them."""
 
     def __init__(self, dataset: Path, u: Tensor, device: torch.device):
         arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}

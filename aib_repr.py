@@ -219,7 +219,7 @@ class ObservationEncoder(nn.Module):
 
 
 class Predictor(nn.Module):
-    """g: (u^s, u^o, a) -> standardised reward (B,) and next latents u^s, u^o (B, u_dim) (Algorithm 1, line 5)."""
+    """g: (u^s, u^o, a) -> (standardised) reward (B,) and next latents u^s, u^o (B, u_dim) (Algorithm 1, line 5)."""
 
     def __init__(self, u_dim: int, action_dim: int):
         super().__init__()
@@ -257,7 +257,7 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> d
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023), N(0, 1) at each step within 1 %."""
+    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); from T = 30 on N(0, 1) within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     # the package's scale leaves out the power at f = 0: correct it
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))
@@ -346,7 +346,7 @@ class TransitionDataset:
 def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
     num_val = round(args.num_episodes * args.val_fraction)
-    if not 4 <= num_val < args.num_episodes:  # stage 2 fits read-outs on half of them and tests them on the other
+    if not 4 <= num_val < args.num_episodes:  # stage 2 fits linear probes on half, tests on the other
         fail(
             f"--val-fraction {args.val_fraction} must hold out 4 or more of --num-episodes {args.num_episodes}, not all"
         )

@@ -168,7 +168,7 @@ QUICK |= dict(num_episodes=8, belief="runs/{env_id}__aib_belief_quick__{seed}/be
 
 
 # ---------------------------------------------------------------- networks
-# HistoryEncoder and AIBBelief are the same in aib_belief.py and ppo_aib.py, which loads the former's weights
+# HistoryEncoder (also ppo_believer.py's) and AIBBelief are the same in aib_belief.py and ppo_aib.py, for the weights
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:
@@ -240,7 +240,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which the head is to infer.
+    The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -359,7 +359,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023), N(0, 1) at each step within 1 %."""
+    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); from T = 30 on N(0, 1) within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     # the package's scale leaves out the power at f = 0: correct it
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))

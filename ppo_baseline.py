@@ -248,7 +248,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023), N(0, 1) at each step within 1 %."""
+    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); from T = 30 on N(0, 1) within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     # the package's scale leaves out the power at f = 0: correct it
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))

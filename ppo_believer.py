@@ -273,7 +273,7 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
 
-    The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which the head is to infer.
+    The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
     def __init__(self, config: dict, amp: bool = False):
@@ -431,7 +431,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 
 
 class EpisodeDataset:
-    """Whole episodes of dataset/ with u, time first; images on the GPU where they fit in half of its free memory."""
+    """dataset/ and u (N, T+1, u_dim) by whole episodes, time first; images on the GPU if half its memory holds them."""
 
     def __init__(self, dataset: Path, u: Tensor, device: torch.device):
         arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
@@ -480,7 +480,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023), N(0, 1) at each step within 1 %."""
+    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); from T = 30 on N(0, 1) within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     # the package's scale leaves out the power at f = 0: correct it
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))
