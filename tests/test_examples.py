@@ -57,7 +57,9 @@ MISTAKES = {  # what a task returns, changed: what check_envs says of it
     "no cue at step 3": lambda env, obs, info: info.pop("cue") if env.t == 3 else None,
     "success must be numbers": lambda env, obs, info: info.update(success=np.bool_(True)),
     "state is not finite at step 2": lambda env, obs, info: info.update(state=info["state"] / (env.t != 2)),
-    "seed": lambda env, obs, info: info.update(state=np.random.default_rng().normal(size=4)),
+    "different seeds": lambda env, obs, info: info.update(state=np.full(4, env.t)),
+    "state must be of": lambda env, obs, info: info.update(state=1.0),
+    "follow from its seed": lambda env, obs, info: info.update(state=np.random.default_rng().normal(size=4)),
 }
 
 

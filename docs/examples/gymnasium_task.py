@@ -83,7 +83,6 @@ def check_envs(envs: gym.vector.VectorEnv, task: str) -> None:
     ends = []
     for _ in range(2):
         obs, info = envs.reset(seed=seeds)
-        first = {name: (array, array.copy()) for name, array in {**obs, "state": info["state"]}.items()}
         for t in range(steps):
             rgb, joints = obs["rgb"], obs["joints"]
             pictures = rgb.dtype == np.uint8 and rgb.ndim == 4 and min(rgb.shape[1:3]) >= 36 and rgb.shape[3] == 3
@@ -95,6 +94,11 @@ def check_envs(envs: gym.vector.VectorEnv, task: str) -> None:
                 values = np.asarray(info[name])
                 assert values.dtype.kind in "fiu", f"info's {name} must be numbers, not {values.dtype}"
                 assert np.isfinite(values).all(), f"info's {name} is not finite at step {t}"
+            state = info["state"]
+            assert state.ndim == 2, "info's state must be of (D,)"
+            if t == 0:
+                assert len(seeds) == 1 or (state[0] != state[-1]).any(), "different seeds must give different episodes"
+                first = {name: (array, array.copy()) for name, array in {**obs, "state": state}.items()}
             obs, reward, terminated, truncated, info = envs.step(actions[t])
             assert t == steps - 1 or not (terminated | truncated).any(), f"an episode ended at step {t + 1} of {steps}"
         for name, (array, copy) in first.items():
