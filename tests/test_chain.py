@@ -24,6 +24,7 @@ import ppo_baseline
 from conftest import ONE_ITERATION, ROOT, TASK, run, spaces
 
 sys.path.append(str(ROOT / "benchmark"))
+import diagnose_agent  # noqa: E402
 import reach  # noqa: E402
 import true_state  # noqa: E402
 
@@ -109,24 +110,30 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
     assert json.dumps(metrics, indent=2) in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
-def test_an_agent_is_diagnosed_and_nothing_is_written(quick_runs: Path) -> None:
-    def diagnose(run_name: str, *options: str, file: str = "agent.pt") -> tuple[int, str, str]:
-        checkpoint = ["--checkpoint", f"runs/{TASK}__{run_name}_quick__1/{file}"]
-        return run("benchmark/diagnose_agent", *checkpoint, *options, cwd=quick_runs.parent)
-
+def test_an_agent_is_diagnosed_and_nothing_is_written(
+    quick_runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(quick_runs.parent)
+    agent = Path("runs") / f"{TASK}__ppo_aib_quick__1" / "agent.pt"
     before = {file: file.stat().st_mtime_ns for file in quick_runs.rglob("*")}
     found = []
     for options in ([], ["--swap-particles"]):
-        code, out, err = diagnose("ppo_aib", "--num-eval-episodes", "3", "--num-workers", "2", *options)
+        arguments = ["--checkpoint", str(agent), "--num-eval-episodes", "2", "--num-workers", "2", *options]
+        code, out, err = run("benchmark/diagnose_agent", *arguments, cwd=quick_runs.parent)
         assert code == 0, err
         found.append(json.loads(out[out.index("{") :]))
         assert 0 <= found[-1]["nearest_is_right"] <= 1
     assert found[0]["u_r2"] != found[1]["u_r2"], "other particles, other actions, other states"
     assert before == {file: file.stat().st_mtime_ns for file in quick_runs.rglob("*")}
-    code, _, err = diagnose("ppo_aib", file="checkpoint.pt")
-    assert code == 2 and "is no agent" in err
-    code, _, err = diagnose("ppo_baseline", "--swap-particles")
-    assert code == 2 and "needs an agent with a belief" in err
+
+    def refused(words: str, args: diagnose_agent.Args) -> None:
+        with pytest.raises(SystemExit):
+            diagnose_agent.main(args)
+        assert words in capsys.readouterr().err
+
+    refused("is no agent", diagnose_agent.Args(agent.with_name("checkpoint.pt")))
+    plain = Path("runs") / f"{TASK}__ppo_baseline_quick__1" / "agent.pt"
+    refused("needs an agent with a belief", diagnose_agent.Args(plain, swap_particles=True))
 
 
 def test_reach_plays_every_second_scene_anew_and_stage_2_takes_it(
