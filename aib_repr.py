@@ -1,7 +1,7 @@
 """AIB stage 1: a random-policy dataset and a compact encoder of the privileged state (paper section 3.1, Algorithm 1).
 
 phi(s) is trained with psi(o) to predict reward and next latents. A KL penalty removes from u = phi(s) what does
-not help to predict, or is seen in o, too. Kept are only phi and the means and deviations of images and joints.
+not help to predict, or is seen in o, too. Only phi and the means and standard deviations of images and joints stay.
 
 Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events; args.json and checkpoint.pt to

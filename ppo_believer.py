@@ -431,7 +431,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 
 
 class EpisodeDataset:
-    """dataset/ and u (N, T+1, u_dim) by whole episodes, time first; images on the GPU if half its memory holds them."""
+    """Whole episodes of dataset/, u (N, T+1, u_dim), time first; images on the GPU if half its free memory suffices."""
 
     def __init__(self, dataset: Path, u: Tensor, device: torch.device):
         arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
