@@ -223,10 +223,7 @@ class HistoryEncoder(nn.Module):
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
     def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """x (T, B, .), the T steps after those in hidden (None: none) -> h (T, B, 256), new hidden (one tensor).
-
-        Training passes whole episodes, rollout one step at a time.
-        """
+        """x (T, B, .), the T steps after those in hidden (None: none) -> h (T, B, 256), new hidden (one tensor)."""
         output, hidden = self.gru(x, hidden)
         return self.out(torch.cat([output, x], -1)), hidden
 
@@ -267,19 +264,14 @@ class AIBBelief(nn.Module):
 def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int | None = None) -> Tensor:
     """h (T+1, B, 256) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J).
 
-    All frames go through the CNN at once, or, where they are more than CNN_CHUNK, in chunks with gradient
-    checkpointing. bptt_steps truncates back-propagation through time.
+    The frames go through the CNN in chunks, all but the last with gradient checkpointing. bptt_steps truncates
+    back-propagation through time.
     """
     rgb, joints = batch["rgb"].flatten(0, 1), batch["joints"].flatten(0, 1)
-    if len(rgb) <= CNN_CHUNK:
-        x = history.embed(rgb, joints)
-    else:
-        embedded = []
-        for chunk in zip(rgb.split(CNN_CHUNK), joints.split(CNN_CHUNK), strict=True):
-            embedded.append(torch.utils.checkpoint.checkpoint(history.embed, *chunk, use_reentrant=False))
-        x = torch.cat(embedded)
+    *chunks, last = zip(rgb.split(CNN_CHUNK), joints.split(CNN_CHUNK), strict=True)
+    x = [torch.utils.checkpoint.checkpoint(history.embed, *chunk, use_reentrant=False) for chunk in chunks]
+    x = torch.cat([*x, history.embed(*last)]).unflatten(0, batch["rgb"].shape[:2])
     outputs, hidden = [], None
-    x = x.unflatten(0, batch["rgb"].shape[:2])
     for piece in x.split(bptt_steps or len(x)):
         h, hidden = history(piece, hidden)
         hidden = hidden.detach()
@@ -333,23 +325,18 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
 
 
 class EpisodeDataset:
-    """Whole episodes of dataset/, u (N, T+1, u_dim), time first; images on the GPU if half its free memory suffices."""
+    """Whole episodes of dataset/ and their u (N, T+1, u_dim), on the disk, or on the GPU where they fit there."""
 
-    def __init__(self, dataset: Path, u: Tensor, device: torch.device):
-        arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")) for name in ("joints", "actions", "cue")}
-        self.arrays = {name: x.to(device) for name, x in (arrays | {"u": u}).items()}
-        self.file, self.device, self.rgb = dataset / "rgb.npy", device, None
-        rgb = np.load(self.file, mmap_mode="c")  # copy-on-write, without which torch warns
-        if device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
-            self.rgb = torch.from_numpy(rgb).to(device)
+    def __init__(self, dataset: Path, u: Tensor, device: str):
+        self.device, self.arrays = device, {"u": u.to(device)}
+        for name in ("rgb", "joints", "actions", "cue"):
+            x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of read-only arrays
+            fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
+            self.arrays[name] = x.to(device) if fits else x
 
     def __call__(self, index: np.ndarray) -> dict[str, Tensor]:
         """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
-        if self.rgb is not None:
-            rgb = self.rgb[index]
-        else:  # opened anew each time, so that pages once read do not stay in this process
-            rgb = torch.from_numpy(np.load(self.file, mmap_mode="r")[index]).to(self.device)
-        batch = {"rgb": rgb, **{name: x[index] for name, x in self.arrays.items()}}
+        batch = {name: x[index].to(self.device) for name, x in self.arrays.items()}
         return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
 
 
@@ -376,7 +363,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
     try:
         with torch.no_grad():
             u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
-        return EpisodeDataset(path / "dataset", u, torch.device(args.device)), stored
+        return EpisodeDataset(path / "dataset", u, args.device), stored
     except (OSError, ValueError) as error:
         fail(f"{path / 'dataset'} is damaged or incomplete ({error}); {hint}")
 
@@ -394,17 +381,14 @@ def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
 
     The ridge of R2 is chosen by cross-validation. Columns that do not vary are left out; nan when none does.
     """
-    varies = y.amax(0) > y.amin(0)
-    if not varies.any():
-        return math.nan
-    y, y_test = y[:, varies], y_test[:, varies]
     model = linear_model.RidgeCV(np.logspace(-3, 4, 8))
     if are_classes(y):
         model = linear_model.LogisticRegression(max_iter=1000)
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y, x_test, y_test))
-    scores = [model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in range(y.shape[1])]
-    return float(np.mean(scores))
+    varying = np.flatnonzero(np.ptp(y, axis=0))
+    scores = [model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in varying]
+    return float(np.mean(scores)) if scores else math.nan
 
 
 @torch.no_grad()
@@ -462,10 +446,8 @@ def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
         z_pairs = torch.cat([part["z_mean"][:, :-1], part["z_mean"][:, 1:]], -1)
         pairs += [z_pairs.flatten(0, 1), part["actions"].flatten(0, 1)]
     report["action_readout"] = probe_score(*pairs)
-    cue = fit["cue"][:, fit["cue"].amax(0) > fit["cue"].amin(0)]
-    report["cue_chance"] = 0.0
-    if cue.numel() and are_classes(cue):
-        report["cue_chance"] = float(np.mean([1 / len(column.unique()) for column in cue.T]))
+    chances = [1 / len(column.unique()) for column in fit["cue"].T if column.min() < column.max()]
+    report["cue_chance"] = float(np.mean(chances)) if are_classes(fit["cue"]) and chances else 0.0
     return report
 
 
@@ -488,15 +470,15 @@ def flow_gain(head: nn.Module, z: Tensor, action: Tensor) -> tuple[float, float]
 
 def main(args: Args) -> None:
     """Train the belief on whole episodes, report what it remembers of held-out ones."""
-    path, device = check_run(args), torch.device(args.device)
+    path = check_run(args)
     if (path / "belief.pt").exists() and not args.overwrite:
         print(f"{path / 'belief.pt'} is finished; --overwrite recreates it")
         return
     episodes, stored = load_episodes(args)
     open_run(path, args)
-    inds, num_val = np.arange(args.num_episodes), stored["num_val"]
-    train, test_on = inds[:-num_val], inds[-(num_val // 2) :]
-    fit_on = inds[-num_val : -(num_val // 2)]  # linear probes are fitted on these and tested on test_on
+    num_val = stored["num_val"]
+    # linear probes are fitted on fit_on and tested on test_on
+    train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-num_val, -(num_val // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {
@@ -522,7 +504,7 @@ def main(args: Args) -> None:
         history.image_mean, history.image_std = stored["norm"]["image_mean"], stored["norm"]["image_std"]
     if args.history_joints:
         history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
-    model.to(device)
+    model.to(args.device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     completed = 0
     if (path / "checkpoint.pt").exists():
@@ -591,11 +573,7 @@ def fail(message: str) -> NoReturn:
 def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)  # only for what selects the defaults
-    settings = TASKS.get(chosen.env_id, {})
-    if chosen.small:
-        settings = settings | SMALL
-    if chosen.quick:
-        settings = settings | QUICK
+    settings = TASKS.get(chosen.env_id, {}) | (QUICK if chosen.quick else SMALL if chosen.small else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")

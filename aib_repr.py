@@ -29,7 +29,6 @@ from typing import Literal, NoReturn
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: idle threads must not starve other runs
 
-import colorednoise
 import gymnasium as gym
 import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
 import numpy as np
@@ -87,8 +86,6 @@ class Args:
     """at most this many scenes at a time; physx_cuda draws one arm pose for all of them"""
     num_episodes: int = 2000
     """episodes of the random policy; 640 are enough for RememberColor3-v0, not for harder tasks"""
-    noise_beta: float = 0.0
-    """exponent of the random actions' spectrum 1/f**beta: 0 is white; with more the arm gets farther"""
     val_fraction: float = 0.1
     """fraction of the episodes held out for validation"""
     epochs: int = 200
@@ -119,7 +116,7 @@ class Args:
 
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
-LIMITS |= dict(val_fraction=(0, 1), noise_beta=(0, 2))
+LIMITS |= dict(val_fraction=(0, 1))
 MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, batch_size=100, learning_rate=1e-3)
@@ -256,19 +253,10 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> d
 # ---------------------------------------------------------------- data
 
 
-def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); from T = 30 on N(0, 1) within 1 %."""
-    noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
-    # the package's scale leaves out the power at f = 0: correct it
-    frequencies = np.abs(np.fft.fftfreq(shape[-1]))
-    power = frequencies.clip(1 / shape[-1]) ** -beta
-    return noise * np.sqrt(power[1:].sum() / power.sum())
-
-
 def random_actions(args: Args, episode: int, steps: int, action_dim: int) -> np.ndarray:
-    """Actions (T, A) of an episode, uniform in [-1, 1] at every step: the normal CDF of colored_noise."""
-    noise = colored_noise(args.noise_beta, (action_dim, steps), np.random.default_rng([args.seed, episode]))
-    return (2 * torch.special.ndtr(torch.from_numpy(noise.T)) - 1).float().numpy()
+    """Actions (T, A) of an episode, uniform in [-1, 1]; they depend on --seed and the episode's number alone."""
+    rng = np.random.default_rng([args.seed, episode])
+    return rng.uniform(-1, 1, (steps, action_dim)).astype(np.float32)
 
 
 def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
@@ -285,31 +273,35 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
         return arrays
     envs, count = make_envs(args), args.num_episodes
     steps, (action_dim,) = gym.spec(args.env_id).max_episode_steps, envs.single_action_space.shape
-    bar = tqdm(total=count * steps, initial=meta["episodes_done"] * steps, desc="random policy", unit="step")
+    bar = tqdm(total=count, initial=meta["episodes_done"], desc="random policy", unit="episode")
     for first in range(meta["episodes_done"], count, envs.num_envs):
         rows = np.arange(first, first + envs.num_envs) % count  # the last round is filled up with repetitions
-        actions = np.stack([random_actions(args, episode, steps, action_dim) for episode in rows])
+        kept = rows[: count - first]
         seeds = (args.seed * 1_000_000 + rows) % 2**29 + 2**30  # above those of PPO's training, below its evaluation's
         obs, info = envs.reset(seed=seeds.tolist())
-        cue = info["cue"]  # at the start: in Rotate tasks it is what is left to turn
-        step = {**obs, "state": info["state"]}
-        buffer = {name: [torch.as_tensor(x)] for name, x in step.items()} | {"rewards": [], "success": []}
-        for t in range(steps):
-            obs, rewards, _, _, info = envs.step(actions[:, t])
-            step = {**obs, "state": info["state"], "rewards": rewards, "success": info["success"]}
-            for name, x in step.items():
-                buffer[name].append(torch.as_tensor(x))
-            bar.update(min(envs.num_envs, count - first))
-        buffer = {name: torch.stack(xs, 1) for name, xs in buffer.items()}
-        buffer |= {"actions": torch.from_numpy(actions), "cue": torch.as_tensor(cue).reshape(len(rows), -1)}
+        frame = common.to_numpy({**obs, "state": info["state"]})
+        actions = np.stack([random_actions(args, episode, steps, action_dim) for episode in rows])
+        cue = common.to_numpy(info["cue"]).reshape(len(rows), -1)  # in Rotate tasks it changes: what is left to turn
         if not arrays:
             path.mkdir(exist_ok=True)
-            for name, x in buffer.items():
+            shapes = {"actions": (steps, action_dim), "rewards": (steps,), "success": (steps,), "cue": cue.shape[1:]}
+            for name, x in frame.items():
+                shapes[name] = (steps + 1, *x.shape[1:])
+            for name, shape in shapes.items():
                 dtype = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32)
-                arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, (count, *x.shape[1:]))
-        for name, x in buffer.items():
-            arrays[name][first : first + envs.num_envs] = x[: count - first].cpu()
-        meta["episodes_done"] = min(first + envs.num_envs, count)
+                arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, (count, *shape))
+        arrays["cue"][kept], arrays["actions"][kept] = cue[: len(kept)], actions[: len(kept)]
+        for t in range(steps + 1):
+            for name, x in frame.items():
+                arrays[name][kept, t] = x[: len(kept)]
+            if t == steps:
+                break
+            obs, rewards, _, _, info = envs.step(actions[:, t])
+            frame = common.to_numpy({**obs, "state": info["state"]})
+            arrays["rewards"][kept, t] = common.to_numpy(rewards)[: len(kept)]
+            arrays["success"][kept, t] = common.to_numpy(info["success"])[: len(kept)]
+        bar.update(len(kept))
+        meta["episodes_done"] = first + len(kept)
         save(path / "meta.json", json.dumps(meta, indent=2).encode())
     bar.close()
     envs.close()
@@ -317,27 +309,25 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
 
 
 class TransitionDataset:
-    """Transitions of dataset/, with or without images; images on the GPU where they fit in half of its free memory."""
+    """Transitions of dataset/, with or without images, on the disk, or on the GPU where they fit there."""
 
-    def __init__(self, dataset: Path, images: bool, device: torch.device):
-        names = ("joints", "state", "actions", "rewards")
-        self.arrays = {name: torch.from_numpy(np.load(dataset / f"{name}.npy")).to(device) for name in names}
-        self.file, self.images, self.device, self.rgb = dataset / "rgb.npy", images, device, None
-        rgb = np.load(self.file, mmap_mode="c")  # copy-on-write, without which torch warns
-        if images and device.type == "cuda" and rgb.nbytes < torch.cuda.mem_get_info()[0] / 2:
-            self.rgb = torch.from_numpy(rgb).to(device)
+    def __init__(self, dataset: Path, images: bool, device: str):
+        self.device, self.arrays = device, {}
+        self.observed = ["joints", "state"]
+        if images:
+            self.observed.append("rgb")
+        for name in (*self.observed, "actions", "rewards"):
+            x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of read-only arrays
+            fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
+            self.arrays[name] = x.to(device) if fits else x
 
     def __call__(self, index: np.ndarray) -> dict[str, Tensor]:
         """Transitions (s, o, a, r, s', o') number index (B,), counted through all episodes (line 3), each (B, ...)."""
         episode, t = np.divmod(index, self.arrays["actions"].shape[1])
         batch = {name: x[episode, t] for name, x in self.arrays.items()}
-        batch |= {f"next_{name}": self.arrays[name][episode, t + 1] for name in ("joints", "state")}
-        if self.images:
-            # opened anew each time, so that pages once read do not stay in this process
-            rgb = np.load(self.file, mmap_mode="r") if self.rgb is None else self.rgb
-            batch["rgb"] = torch.as_tensor(rgb[episode, t], device=self.device)
-            batch["next_rgb"] = torch.as_tensor(rgb[episode, t + 1], device=self.device)
-        return batch
+        for name in self.observed:
+            batch[f"next_{name}"] = self.arrays[name][episode, t + 1]
+        return {name: x.to(self.device) for name, x in batch.items()}
 
 
 # ---------------------------------------------------------------- training
@@ -350,7 +340,7 @@ def main(args: Args) -> None:
         fail(
             f"--val-fraction {args.val_fraction} must hold out 4 or more of --num-episodes {args.num_episodes}, not all"
         )
-    path, device = check_run(args), torch.device(args.device)
+    path = check_run(args)
     if (path / "repr.pt").exists() and not args.overwrite:
         print(f"{path / 'repr.pt'} is finished; --overwrite recreates it")
         return
@@ -367,7 +357,7 @@ def main(args: Args) -> None:
             fail(f"the pictures take {size / 1e9:.1f} GB, more than the disk has; free some or lower --num-episodes")
     open_run(path, args)
     arrays = collect_random_episodes(args, path / "dataset")
-    transitions = TransitionDataset(path / "dataset", args.psi_images, device)
+    transitions = TransitionDataset(path / "dataset", args.psi_images, args.device)
     train = {name: x[:-num_val] for name, x in arrays.items()}
     steps, action_dim = arrays["actions"].shape[1:]
 
@@ -387,7 +377,7 @@ def main(args: Args) -> None:
     if args.reward_norm:
         g.reward_mean.fill_(train["rewards"].mean(dtype=np.float64))
         g.reward_std.fill_(train["rewards"].std(dtype=np.float64) + 1e-8)
-    model = nn.ModuleDict({"phi": phi, "psi": psi, "g": g}).to(device)
+    model = nn.ModuleDict({"phi": phi, "psi": psi, "g": g}).to(args.device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     train_inds, val_inds = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
     updates_per_epoch, completed = math.ceil(len(train_inds) / args.batch_size), 0
@@ -398,9 +388,9 @@ def main(args: Args) -> None:
         completed = checkpoint["epoch"]
         print(f"resuming {path} at epoch {completed}", flush=True)
     writer = SummaryWriter(path, purge_step=completed * updates_per_epoch + 1)
-    bar = tqdm(total=args.epochs * updates_per_epoch, initial=completed * updates_per_epoch, desc="phi", unit="update")
+    bar = tqdm(range(completed, args.epochs), "phi", args.epochs, initial=completed, unit="epoch")
 
-    for epoch in range(completed, args.epochs):
+    for epoch in bar:
         torch.manual_seed(args.seed * 1_000_000 + epoch)  # so that a resumed run repeats the epoch
         order = np.random.default_rng([args.seed, epoch]).permutation(train_inds)
         for index in np.array_split(order, updates_per_epoch):
@@ -410,7 +400,6 @@ def main(args: Args) -> None:
             # clips nothing, stops at NaN
             nn.utils.clip_grad_norm_(model.parameters(), math.inf, error_if_nonfinite=True)
             optimizer.step()
-            bar.update()
 
         with torch.no_grad():
             val_batch = transitions(np.random.default_rng(0).choice(val_inds, min(1000, len(val_inds)), replace=False))
@@ -425,7 +414,6 @@ def main(args: Args) -> None:
         writer.flush()
         checkpoint = {"epoch": epoch + 1, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
         save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
-    bar.close()
 
     content = {"kind": "repr", **asdict(args), "num_val": num_val}
     save(path / "repr.pt", {**content, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())})
@@ -482,43 +470,27 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
-# the next three make a CPU faster, at the cost of slightly different pictures
+# the next two make a CPU faster, at the cost of slightly different pictures
 
 
 @contextmanager
 def shaders_without_brdf_table() -> Iterator[None]:
     """Start SAPIEN without its table for reflections of a sky, most of the start on a CPU: these tasks have no sky."""
-    set_shader_dir = sapien.render.set_camera_shader_dir
+    shaders = Path(sapien.__file__).parent / "vulkan_shader"
     with tempfile.TemporaryDirectory() as folder:
-        pack = f"{folder}/minimal"
-        shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", folder, dirs_exist_ok=True)
-        for file in Path(pack).glob("*.frag"):
+        shutil.copytree(shaders, folder, dirs_exist_ok=True)
+        for file in Path(folder).glob("minimal/*.frag"):
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
-        sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
-        try:
-            yield
-        finally:
-            sapien.render.set_camera_shader_dir = set_shader_dir
-
-
-def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
-    """Draw entities as meshes: (local pose, vertices, triangles, normals, texture coordinates, material)."""
-    for entity in entities:
-        body = RenderBodyComponent()
-        for local_pose, *arrays in meshes:
-            shape = RenderShapeTriangleMesh(*arrays)
-            shape.local_pose = local_pose
-            body.attach(shape)
-        entity.remove_component(entity.find_component_by_type(RenderBodyComponent))
-        entity.add_component(body)
+        sapien.pysapien.render._internal_set_shader_search_path(folder)
+        yield
+    sapien.pysapien.render._internal_set_shader_search_path(str(shaders))
 
 
 def decimate_meshes(task: gym.Env, triangles: int) -> None:
-    """Draw the robot with about so many triangles per mesh and the ground with two; objects are drawn as they are.
+    """Draw the robot with about so many triangles per mesh; all else is drawn as it is.
 
-    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground is
-    a flat grid of 20,000: its four corners draw the same picture.
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
     """
     for link in task.agent.robot.get_links():
         entities, meshes = [body.entity for body in link._objs], []  # one per scene
@@ -532,15 +504,16 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
                     mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files triangles share none
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
-                arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))
-                meshes.append((shape.local_pose, *arrays, part.material))
-        replace_meshes(entities, meshes)
-    ground = task.scene.actors["ground"]._objs
-    part = ground[0].find_component_by_type(RenderBodyComponent).render_shapes[0].parts[0]
-    width = math.isqrt(len(part.vertices))
-    corners = [0, width - 1, -width, -1]
-    arrays = part.vertices[corners], [[0, 2, 3], [0, 3, 1]], part.get_vertex_normal()[corners]
-    replace_meshes(ground, [(sapien.Pose(), *arrays, part.get_vertex_uv()[corners], part.material)])
+                uv = np.zeros((len(mesh.vertices), 2))
+                meshes.append((shape.local_pose, mesh.vertices, mesh.faces, mesh.vertex_normals, uv, part.material))
+        for entity in entities:
+            body = RenderBodyComponent()
+            for local_pose, *arrays in meshes:
+                shape = RenderShapeTriangleMesh(*arrays)
+                shape.local_pose = local_pose
+                body.attach(shape)
+            entity.remove_component(entity.find_component_by_type(RenderBodyComponent))
+            entity.add_component(body)
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
@@ -617,11 +590,7 @@ def fail(message: str) -> NoReturn:
 def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)  # only for what selects the defaults
-    settings = TASKS.get(chosen.env_id, {})
-    if chosen.small:
-        settings = settings | SMALL
-    if chosen.quick:
-        settings = settings | QUICK
+    settings = TASKS.get(chosen.env_id, {}) | (QUICK if chosen.quick else SMALL if chosen.small else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")

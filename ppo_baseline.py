@@ -268,15 +268,13 @@ def rollout(
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
-    device = torch.device(args.device)
+    device = args.device
     (action_dim,) = envs.single_action_space.shape
     noise = colored_noise(args.noise_beta, (num_episodes, action_dim, steps), np.random.default_rng(seeds))
     noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
-    rounds = range(0, num_episodes, envs.num_envs)
     desc = "evaluation" if deterministic else "rollout"
-    bar = tqdm(total=len(rounds) * steps, desc=desc, unit="step", unit_scale=envs.num_envs, leave=False)
-    for first in rounds:
+    for first in tqdm(range(0, num_episodes, envs.num_envs), desc, unit="round", leave=False):
         # the last round is filled up with repeated episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
         kept = rows[: num_episodes - first]
@@ -297,8 +295,6 @@ def rollout(
                 if name not in buffer:
                     buffer[name] = value.new_empty(steps, num_episodes, *value.shape[1:])
                 buffer[name][t, kept] = value[: len(kept)]
-            bar.update()
-    bar.close()
     return buffer
 
 
@@ -316,13 +312,12 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
-    rgb = buffer["rgb"][:, :4].cpu().numpy()
-    scale = 2 * math.ceil(128 / rgb.shape[2])  # even, as mp4 needs its sizes
-    rgb = rgb.repeat(scale, axis=2).repeat(scale, axis=3)
+    rgb = np.array(buffer["rgb"][:, :4].cpu())
     succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
-    rgb[1:, :, :8][succeeded] = (0, 255, 0)
+    rgb[1:, :, :4][succeeded] = (0, 255, 0)
     rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)
-    return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1)
+    size = ["-vf", "scale=-2:256:flags=neighbor"]  # 256 pixels high, and as wide as that makes it, to an even number
+    return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1, output_params=size)
 
 
 def evaluate(
@@ -343,8 +338,8 @@ def evaluate_checkpoint(args: Args) -> None:
     for name in ("env_id", "robot_triangles", "image_size", "num_envs", "amp"):
         setattr(args, name, stored[name])
     check_task(args)
-    envs, device = make_envs(args), torch.device(args.device)
-    agent = Agent(envs, args).to(device)
+    envs = make_envs(args)
+    agent = Agent(envs, args).to(args.device)
     agent.load_state_dict(stored["agent"])
     metrics, video = evaluate(envs, agent, args, TEST_SEED)
     metrics |= {"global_step": stored["global_step"], "num_eval_episodes": args.num_eval_episodes}
@@ -372,9 +367,9 @@ def main(args: Args) -> None:
         return
     open_run(path, args)
 
-    envs, device = make_envs(args), torch.device(args.device)
+    envs = make_envs(args)
     torch.manual_seed(args.seed)
-    agent = Agent(envs, args).to(device)
+    agent = Agent(envs, args).to(args.device)
     others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]
     cnn = {"params": agent.cnn.parameters(), "lr": args.cnn_lr_scale * args.learning_rate}
     optimizer = torch.optim.Adam([cnn, {"params": others}], lr=args.learning_rate, eps=1e-5, fused=True)
@@ -385,9 +380,10 @@ def main(args: Args) -> None:
         optimizer.load_state_dict(checkpoint["optimizer"])
         print(f"resuming {path} at step {completed * batch_size:,}", flush=True)
     writer = SummaryWriter(path, purge_step=completed * batch_size + 1)
-    bar = tqdm(total=num_iterations * batch_size, initial=completed * batch_size, desc="PPO", unit="step")
+    iterations = range(completed + 1, num_iterations + 1)
+    bar = tqdm(iterations, "PPO", num_iterations, initial=completed, unit="iteration")
 
-    for iteration in range(completed + 1, num_iterations + 1):
+    for iteration in bar:
         start = time.time()
         global_step = iteration * batch_size  # after this iteration
         if args.final_std is not None:
@@ -408,7 +404,7 @@ def main(args: Args) -> None:
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
         applied = []  # losses of the minibatches that led to an optimizer step
         for _ in range(args.update_epochs):
-            for mb_inds in torch.randperm(batch_size, device=device).tensor_split(args.num_minibatches):
+            for mb_inds in torch.randperm(batch_size, device=args.device).tensor_split(args.num_minibatches):
                 losses = ppo_losses(agent, {name: x[mb_inds] for name, x in batch.items()}, args)
                 stop = losses["approx_kl"] > args.target_kl
                 if stop:
@@ -450,8 +446,6 @@ def main(args: Args) -> None:
         writer.flush()
         states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "reward_var": reward_var}
         save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": evals, **states})
-        bar.update(batch_size)
-    bar.close()
     envs.close()
     for name in ("success_once", "success_at_end", "return"):
         values = [row[name] for row in evals]
@@ -508,43 +502,27 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
-# the next three make a CPU faster, at the cost of slightly different pictures
+# the next two make a CPU faster, at the cost of slightly different pictures
 
 
 @contextmanager
 def shaders_without_brdf_table() -> Iterator[None]:
     """Start SAPIEN without its table for reflections of a sky, most of the start on a CPU: these tasks have no sky."""
-    set_shader_dir = sapien.render.set_camera_shader_dir
+    shaders = Path(sapien.__file__).parent / "vulkan_shader"
     with tempfile.TemporaryDirectory() as folder:
-        pack = f"{folder}/minimal"
-        shutil.copytree(Path(sapien.__file__).parent / "vulkan_shader", folder, dirs_exist_ok=True)
-        for file in Path(pack).glob("*.frag"):
+        shutil.copytree(shaders, folder, dirs_exist_ok=True)
+        for file in Path(folder).glob("minimal/*.frag"):
             text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
             file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
-        sapien.render.set_camera_shader_dir = lambda name: set_shader_dir(pack if name == "minimal" else name)
-        try:
-            yield
-        finally:
-            sapien.render.set_camera_shader_dir = set_shader_dir
-
-
-def replace_meshes(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
-    """Draw entities as meshes: (local pose, vertices, triangles, normals, texture coordinates, material)."""
-    for entity in entities:
-        body = RenderBodyComponent()
-        for local_pose, *arrays in meshes:
-            shape = RenderShapeTriangleMesh(*arrays)
-            shape.local_pose = local_pose
-            body.attach(shape)
-        entity.remove_component(entity.find_component_by_type(RenderBodyComponent))
-        entity.add_component(body)
+        sapien.pysapien.render._internal_set_shader_search_path(folder)
+        yield
+    sapien.pysapien.render._internal_set_shader_search_path(str(shaders))
 
 
 def decimate_meshes(task: gym.Env, triangles: int) -> None:
-    """Draw the robot with about so many triangles per mesh and the ground with two; objects are drawn as they are.
+    """Draw the robot with about so many triangles per mesh; all else is drawn as it is.
 
-    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels. The ground is
-    a flat grid of 20,000: its four corners draw the same picture.
+    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
     """
     for link in task.agent.robot.get_links():
         entities, meshes = [body.entity for body in link._objs], []  # one per scene
@@ -558,15 +536,16 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
                     mesh.merge_vertices(digits_vertex=2)  # within 1 cm; in the files triangles share none
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
-                arrays = mesh.vertices, mesh.faces, mesh.vertex_normals, np.zeros((len(mesh.vertices), 2))
-                meshes.append((shape.local_pose, *arrays, part.material))
-        replace_meshes(entities, meshes)
-    ground = task.scene.actors["ground"]._objs
-    part = ground[0].find_component_by_type(RenderBodyComponent).render_shapes[0].parts[0]
-    width = math.isqrt(len(part.vertices))
-    corners = [0, width - 1, -width, -1]
-    arrays = part.vertices[corners], [[0, 2, 3], [0, 3, 1]], part.get_vertex_normal()[corners]
-    replace_meshes(ground, [(sapien.Pose(), *arrays, part.get_vertex_uv()[corners], part.material)])
+                uv = np.zeros((len(mesh.vertices), 2))
+                meshes.append((shape.local_pose, mesh.vertices, mesh.faces, mesh.vertex_normals, uv, part.material))
+        for entity in entities:
+            body = RenderBodyComponent()
+            for local_pose, *arrays in meshes:
+                shape = RenderShapeTriangleMesh(*arrays)
+                shape.local_pose = local_pose
+                body.attach(shape)
+            entity.remove_component(entity.find_component_by_type(RenderBodyComponent))
+            entity.add_component(body)
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
@@ -643,11 +622,7 @@ def fail(message: str) -> NoReturn:
 def parse_args() -> Args:
     """Read the command line; defaults follow --env-id, --small and --quick, so that --help shows what will run."""
     chosen, _ = tyro.cli(Args, add_help=False, return_unknown_args=True)  # only for what selects the defaults
-    settings = TASKS.get(chosen.env_id, {})
-    if chosen.small:
-        settings = settings | SMALL
-    if chosen.quick:
-        settings = settings | QUICK
+    settings = TASKS.get(chosen.env_id, {}) | (QUICK if chosen.quick else SMALL if chosen.small else {})
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")

@@ -170,25 +170,7 @@ def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:
 
     names = set(stock.unwrapped.scene.actors)
     assert {"ball", "goal_region", "ground"} <= names
-    assert all(shapes(stock, name) == shapes(light, name) for name in names - {"ground"})
-
-
-def test_the_ground_of_two_triangles_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    flat = aib_repr.make_task(aib_repr.Args(env_id=TASK, image_size=64), 1)
-    body = flat.unwrapped.scene.actors["ground"]._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
-    assert len(body.render_shapes[0].parts[0].triangles) == 2
-    replace_meshes = aib_repr.replace_meshes
-
-    def of_the_robot_only(entities: list[sapien.Entity], meshes: list[tuple]) -> None:
-        if len(meshes[0][2]) > 2:  # triangles
-            replace_meshes(entities, meshes)
-
-    monkeypatch.setattr(aib_repr, "replace_meshes", of_the_robot_only)
-    grid = aib_repr.make_task(aib_repr.Args(env_id=TASK, image_size=64), 1)
-    pictures, expected = (env.reset(seed=1)[0]["rgb"].astype(int) for env in (flat, grid))
-    assert pictures.shape == (64, 64, 3) and np.abs(pictures - expected).max() <= 1
-    flat.close()
-    grid.close()
+    assert all(shapes(stock, name) == shapes(light, name) for name in names)
 
 
 def test_every_scene_of_a_batch_gets_the_decimated_meshes() -> None:
@@ -196,10 +178,8 @@ def test_every_scene_of_a_batch_gets_the_decimated_meshes() -> None:
     envs = [aib_repr.make_task(aib_repr.Args(env_id=TASK, robot_triangles=0), 1) for _ in range(2)]
     links = zip(*(env.unwrapped.agent.robot.get_links() for env in envs), strict=True)
     batch = [SimpleNamespace(_objs=[link._objs[0] for link in pair]) for pair in links]
-    ground = [env.unwrapped.scene.actors["ground"]._objs[0] for env in envs]
     robot = SimpleNamespace(get_links=lambda: batch)
-    scene = SimpleNamespace(actors={"ground": SimpleNamespace(_objs=ground)})
-    aib_repr.decimate_meshes(SimpleNamespace(agent=SimpleNamespace(robot=robot), scene=scene), 500)
+    aib_repr.decimate_meshes(SimpleNamespace(agent=SimpleNamespace(robot=robot)), 500)
     for link in batch:
         for body in link._objs:
             drawn = body.entity.find_component_by_type(sapien.render.RenderBodyComponent)
@@ -211,13 +191,12 @@ def test_every_scene_of_a_batch_gets_the_decimated_meshes() -> None:
         env.close()
 
 
-def test_random_actions_are_uniform_at_every_step_whatever_their_colour() -> None:
-    persistence = []
-    for beta in (0.0, 0.7):
-        args = aib_repr.Args(noise_beta=beta)
-        actions = np.stack([aib_repr.random_actions(args, episode, 60, 8) for episode in range(2000)])
-        assert actions.shape == (2000, 60, 8) and actions.dtype == np.float32 and np.abs(actions).max() <= 1
-        deciles = np.quantile(actions.transpose(1, 0, 2).reshape(60, -1), np.linspace(0.1, 0.9, 9), axis=1)
-        assert np.abs(deciles - np.linspace(-0.8, 0.8, 9)[:, None]).max() < 0.06 + 0.06 * beta
-        persistence.append(np.corrcoef(actions[:, 1:].ravel(), actions[:, :-1].ravel())[0, 1])
-    assert abs(persistence[0]) < 0.01 and persistence[1] > 0.3
+def test_random_actions_are_uniform_and_independent() -> None:
+    args = aib_repr.Args()
+    actions = np.stack([aib_repr.random_actions(args, episode, 60, 8) for episode in range(2000)])
+    assert actions.shape == (2000, 60, 8) and actions.dtype == np.float32 and np.abs(actions).max() <= 1
+    deciles = np.quantile(actions.transpose(1, 0, 2).reshape(60, -1), np.linspace(0.1, 0.9, 9), axis=1)
+    assert np.abs(deciles - np.linspace(-0.8, 0.8, 9)[:, None]).max() < 0.06, "at every step"
+    assert abs(np.corrcoef(actions[:, 1:].ravel(), actions[:, :-1].ravel())[0, 1]) < 0.01
+    assert np.array_equal(actions[7], aib_repr.random_actions(args, 7, 60, 8))
+    assert not np.array_equal(actions[7], aib_repr.random_actions(aib_repr.Args(seed=2), 7, 60, 8))

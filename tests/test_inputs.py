@@ -108,7 +108,6 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_baseline", ["--num-eval-episodes", "1"], ["--num-eval-episodes 1 must be at least 2"]),
         ("ppo_aib", ["--noise-beta", "2.5"], ["--noise-beta 2.5", "between 0 and 2"]),
         ("ppo_believer", ["--noise-beta", "nan"], ["--noise-beta nan"]),
-        ("aib_repr", ["--noise-beta", "3"], ["--noise-beta 3.0", "between 0 and 2"]),
         ("ppo_baseline", ["--gamma", "1.5"], ["--gamma 1.5", "between 0 and 1"]),
         ("ppo_aib", ["--small", "--quick"], ["--small and --quick exclude each other"]),
         ("ppo_baseline", ["--exp-name", "a/b"], ["--exp-name a/b", "without /"]),

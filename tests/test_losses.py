@@ -104,7 +104,7 @@ def test_transitions_lie_within_an_episode_and_each_is_learnt_from_once_an_epoch
 ) -> None:
     dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
     arrays = {file.stem: np.load(file) for file in dataset.glob("*.npy")}
-    batch = aib_repr.TransitionDataset(dataset, True, torch.device("cpu"))(np.array([0, 9, 10, 199]))
+    batch = aib_repr.TransitionDataset(dataset, True, "cpu")(np.array([0, 9, 10, 199]))
     for row, (episode, t) in enumerate([(0, 0), (0, 9), (1, 0), (19, 9)]):
         for name in ("rgb", "joints", "state", "actions", "rewards"):
             assert np.array_equal(batch[name][row], arrays[name][episode, t]), name
@@ -333,7 +333,7 @@ def test_psi_without_images_sees_the_joints_alone(toy_stages: Path) -> None:
     q, other = psi(None, torch.zeros(2, 7)), psi(None, torch.ones(2, 7))
     assert q.mean.shape == (2, 4) and not torch.allclose(q.mean, other.mean)
     dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
-    batch = aib_repr.TransitionDataset(dataset, False, torch.device("cpu"))(np.array([3, 4]))
+    batch = aib_repr.TransitionDataset(dataset, False, "cpu")(np.array([3, 4]))
     assert set(batch) == {"joints", "state", "actions", "rewards", "next_joints", "next_state"}
     psi = aib_repr.ObservationEncoder(tuple(IMAGE), 3, 4, images=False)
     model = nn.ModuleDict({"phi": aib_repr.StateEncoder(4, 4), "psi": psi, "g": aib_repr.Predictor(4, 2)})
