@@ -84,7 +84,7 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot_triangles: int = 0 if CUDA else 500
-    """triangles of each robot mesh, about; with 500 a CPU steps 5 to 14 times as fast; 0: meshes as they are"""
+    """triangles of each robot mesh, about; with 500 a CPU steps 5 to 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
