@@ -89,7 +89,7 @@ class Args:
     belief_lr: float = 3e-4
     """Adam's learning rate for the belief"""
     belief_anneal: bool = False
-    """let that learning rate fall linearly to 0 over the second half of the updates"""
+    """let belief_lr fall linearly to 0 over the second half of the updates"""
     z_dim: int = 32
     """size of z"""
     beta: float = 1.0
@@ -99,7 +99,7 @@ class Args:
     action_lambda: float = 1.0
     """weight of the action head's loss"""
     fm_latent: Literal["mean", "sample"] = "mean"
-    """z that the action head gets: q's means, or samples of q, as in the paper, which are mostly noise at first"""
+    """z that the action head gets: means of q; or samples of q (the paper's choice), mostly noise at first"""
     bptt_steps: int | None = None
     """cut back-propagation through time after this many steps; None: never"""
     image_norm: Literal["mean", "none"] = "mean"
@@ -121,7 +121,8 @@ class Args:
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
 LIMITS |= dict(image_shift=(0, math.inf))
-MAY_DIFFER = ("overwrite", "num_workers", "sim_backend", "render_backend")  # when a run is resumed
+# when a run is resumed; this stage does not simulate, it hands backends and workers on to aib_repr.py
+MAY_DIFFER = ("overwrite", "num_workers", "sim_backend", "render_backend")
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
 SMALL |= dict(image_size=64, repr_dir="runs/{env_id}__aib_repr_small__{seed}")
@@ -130,7 +131,7 @@ QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 
 
 # ---------------------------------------------------------------- networks
-# HistoryEncoder (also ppo_believer.py's) and AIBBelief are the same in aib_belief.py and ppo_aib.py, for the weights
+# identical in all scripts that have them: belief.pt is written by one and read by another
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:
@@ -223,18 +224,19 @@ class HistoryEncoder(nn.Module):
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
     def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """x (T, B, .), the T steps after those in hidden (None: none) -> h (T, B, 256), new hidden (one tensor)."""
+        """The next T steps x (T, B, .), GRU state before (None: at the start) -> h (T, B, 256), GRU state after."""
         output, hidden = self.gru(x, hidden)
         return self.out(torch.cat([output, x], -1)), hidden
 
 
 def chrono_init(gru: nn.GRU, steps: int) -> None:
     """Let the GRU begin with time constants of 2 to steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
-    gate = slice(gru.hidden_size, 2 * gru.hidden_size)  # after the reset gate; h' = (1 - gate) n + gate h
+    # PyTorch's order is reset, update, new; h' = (1 - update) * new + update * h
+    update = slice(gru.hidden_size, 2 * gru.hidden_size)
     for layer in range(gru.num_layers):
         with torch.no_grad():
-            getattr(gru, f"bias_ih_l{layer}")[gate] = torch.empty(gru.hidden_size).uniform_(1, steps - 1).log()
-            getattr(gru, f"bias_hh_l{layer}")[gate] = 0
+            getattr(gru, f"bias_ih_l{layer}")[update] = torch.empty(gru.hidden_size).uniform_(1, steps - 1).log()
+            getattr(gru, f"bias_hh_l{layer}")[update] = 0
 
 
 class AIBBelief(nn.Module):
@@ -280,7 +282,10 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int
 
 
 def elbo_terms(belief: nn.Module, posterior: nn.Module, u: Tensor, h: Tensor) -> tuple[Tensor, ...]:
-    """u (..., u_dim), h (..., 256) -> -L_VAE's -log p(u|z,h) and KL(q || p) (...,); z ~ q and q's mean (..., z_dim)."""
+    """The two terms of -L_VAE, and z: u (..., u_dim), h (..., 256) -> four tensors.
+
+    -log p(u|z,h) (...,); KL(q || p) (...,); the sample z ~ q (..., z_dim) in the first; the mean of q (..., z_dim).
+    """
     q = posterior(torch.cat([u, h], -1))
     z = q.rsample()
     nll = -belief.decoder(torch.cat([z, h], -1)).log_prob(u).sum(-1)
@@ -300,10 +305,10 @@ def flow_matching_loss(
 
 
 def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
-    """L_Total = -L_VAE (KL weighted by beta) + lambda L_FM, and its terms, means over EpisodeDataset's batch.
+    """L_Total = -L_VAE + lambda L_FM, with the KL in L_VAE weighted by beta, and its terms; means over the batch.
 
-    L_FM gets the means of q, with args.fm_latent sample its samples, as in the paper. With args.action_head mse, the
-    squared error of the actions stands in L_FM's place.
+    batch: of EpisodeDataset. --fm-latent: z in L_FM is q's mean, or a sample of q (the paper's choice).
+    --action-head mse: the squared error of the predicted action in place of L_FM; none: neither.
     """
     h = encode_history(model["belief"].history, batch, args.bptt_steps)
     nll, kl, z_sample, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
@@ -393,13 +398,13 @@ def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
 
 @torch.no_grad()
 def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> dict[str, Tensor]:
-    """What the belief makes of episodes index (E,).
+    """What the belief makes of episodes index (E,); shapes are (E, T+1, ...) but for actions and cue.
 
-    h (E, T+1, 256); u (E, T+1, u_dim), actions (E, T, A), cue (E, K): the episodes' own
-    z_mean (E, T+1, z_dim): mean of q(z|u,h)
-    u_prior (E, T+1, u_dim): mean particle, of 30 means of p(u|z,h) with z ~ p(z|h); u_posterior: z_mean decoded
-    nll_prior (E, T+1): -log of the mean of p(u|z,h) over those 30 samples: low as soon as some samples are near u, even
-    if others lie elsewhere; nll_posterior (E, T+1): -log p(u|z,h) with z ~ q(z|u,h)
+    u, actions (E, T, A), cue (E, K): from the episodes; h: of the history
+    z_mean: mean of q(z|u,h); u_posterior: u decoded from z_mean
+    u_prior: mean of 30 particles, each the mean of p(u|z,h) for one z ~ p(z|h)
+    nll_prior: -log of p(u|z,h) averaged over the same 30 z; low as soon as some of them explain u
+    nll_posterior: -log p(u|z,h) for one z ~ q(z|u,h)
     """
     belief.eval()
     torch.manual_seed(0)  # the same noise every time, so that errors compare
@@ -424,12 +429,15 @@ def encode(belief: nn.Module, posterior: nn.Module, episodes: EpisodeDataset, in
 
 
 def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
-    """What the belief knows of the episodes test (encode's); linear probes are fitted on the episodes fit.
+    """What the belief knows of episodes test; linear probes are fitted on episodes fit (both from encode).
 
-    By time step: u_r2_prior, u_r2_posterior, R2 of u from the mean particle and from z_mean decoded; cue_from_h,
-    cue_from_particle (the mean one), cue_from_u, probes of the memory variable. Single numbers: nll_prior,
-    nll_posterior, means; action_readout, probe of a_t from z_mean at t and t + 1; cue_chance, accuracy of guessing (0
-    for R2).
+    By time step:
+    u_r2_prior, u_r2_posterior: R2 of u_prior and u_posterior
+    cue_from_h, cue_from_particle, cue_from_u: probes of the memory variable from h, u_prior and u
+    Single numbers:
+    nll_prior, nll_posterior: means
+    action_readout: R2 of a probe of a_t from z_mean at t and t + 1
+    cue_chance: accuracy of guessing the cue; 0 where it is a quantity
     """
     report = {name: test[name].mean().item() for name in ("nll_prior", "nll_posterior")}
     total = (test["u"] - test["u"].mean(0)).square().sum((0, 2)).clamp(min=1e-8)
@@ -441,11 +449,10 @@ def probe_belief(fit: dict[str, Tensor], test: dict[str, Tensor]) -> dict:
         for t in range(test[source].shape[1]):
             scores.append(probe_score(fit[source][:, t], fit["cue"], test[source][:, t], test["cue"]))
         report[f"cue_from_{name}"] = scores
-    pairs = []
-    for part in (fit, test):
-        z_pairs = torch.cat([part["z_mean"][:, :-1], part["z_mean"][:, 1:]], -1)
-        pairs += [z_pairs.flatten(0, 1), part["actions"].flatten(0, 1)]
-    report["action_readout"] = probe_score(*pairs)
+    z, z_test = fit["z_mean"], test["z_mean"]
+    x = torch.cat([z[:, :-1], z[:, 1:]], -1).flatten(0, 1)
+    x_test = torch.cat([z_test[:, :-1], z_test[:, 1:]], -1).flatten(0, 1)
+    report["action_readout"] = probe_score(x, fit["actions"].flatten(0, 1), x_test, test["actions"].flatten(0, 1))
     chances = [1 / len(column.unique()) for column in fit["cue"].T if column.min() < column.max()]
     report["cue_chance"] = float(np.mean(chances)) if are_classes(fit["cue"]) and chances else 0.0
     return report
@@ -491,7 +498,7 @@ def main(args: Args) -> None:
     }
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": AIBBelief(config, args.belief_amp)})
-    # posterior and head serve training alone: belief.pt goes without them
+    # PPO needs neither posterior nor head: belief.pt goes without them
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     if args.action_head != "none":
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
@@ -548,7 +555,8 @@ def main(args: Args) -> None:
             save(path / "checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
 
     # no early stopping: held-out error and likelihood are best before h holds the cue
-    fit, test = (encode(model["belief"], model["posterior"], episodes, index) for index in (fit_on, test_on))
+    fit = encode(model["belief"], model["posterior"], episodes, fit_on)
+    test = encode(model["belief"], model["posterior"], episodes, test_on)
     report = probe_belief(fit, test)
     if args.action_head == "flow":
         report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["actions"])
@@ -577,8 +585,8 @@ def parse_args() -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")
-    if "/" in args.exp_name:
-        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
+    if set("/{}") & set(args.exp_name):
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without / and braces")
     for name, value in asdict(args).items():
         flag = f"--{name.replace('_', '-')} {value}"
         low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
@@ -586,8 +594,8 @@ def parse_args() -> Args:
             bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
             fail(f"{flag} must be {bounds}")
         try:
-            str(value).format(**vars(args))
-        except (IndexError, KeyError, ValueError):
+            str(value).format(**vars(args))  # paths may contain {env_id} and {seed}
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
             fail(f"{flag} has braces around what is no argument's name; {{env_id}} and {{seed}} are")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
@@ -612,19 +620,19 @@ def check_run(args: Args) -> Path:
 
 
 def open_run(path: Path, args: Args) -> None:
-    """Make the run's directory, for this process alone as long as it lives, once all inputs have been read.
+    """Make the run's directory and lock it until this process ends; fails when another process holds the lock.
 
-    With --overwrite what it holds is deleted. Fails when another process works there.
+    With --overwrite all that it holds is deleted, so call this only when all inputs have been read.
     """
-    recorded = path / "args.json"
+    args_file = path / "args.json"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
         if args.overwrite:
-            save(recorded, b"{}")  # what a kill leaves half deleted must not be resumed
-            for file in set(path.iterdir()) - {recorded}:
+            save(args_file, b"{}")  # if the deletion is interrupted, check_run finds this and refuses to resume
+            for file in set(path.iterdir()) - {args_file}:
                 shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
-        save(recorded, json.dumps(asdict(args), indent=2).encode())
+        save(args_file, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
 
@@ -643,8 +651,8 @@ def save(path: Path, content: dict | bytes) -> None:
 def load(path: Path, hint: str, **expected: object) -> dict:
     """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
     if not path.exists():
-        fail(f"{path} does not exist")
-    expected["format"] = FORMAT
+        fail(f"{path} does not exist; run the script that writes it first, or correct the path")
+    expected = {"format": FORMAT, **expected}  # first, as another format explains all other differences
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         found = {name: content.get(name) for name in expected}
@@ -672,7 +680,7 @@ def run_stage(script: str, args: Args) -> None:
     try:
         stage.wait()
     except KeyboardInterrupt:
-        stage.wait()  # Ctrl-C reaches the stage, too, and the stage says so
+        sys.exit(stage.wait() or 1)  # Ctrl-C has reached the stage, too, and the stage has said so
     if stage.returncode:
         sys.exit(stage.returncode)
 
@@ -681,4 +689,4 @@ if __name__ == "__main__":
     try:
         main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; training resumes from its last checkpoint with the same command, without --overwrite")
+        sys.exit("\nstopped; the same command, without --overwrite, goes on from what was saved last")

@@ -107,7 +107,7 @@ class Args:
     belief_lr: float = 3e-4
     """Adam's learning rate for the belief"""
     belief_anneal: bool = False
-    """let that learning rate fall linearly to 0 over the second half of the updates"""
+    """let belief_lr fall linearly to 0 over the second half of the updates"""
     z_dim: int = 32
     """size of z"""
     beta: float = 1.0
@@ -294,18 +294,19 @@ class HistoryEncoder(nn.Module):
         return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
 
     def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """x (T, B, .), the T steps after those in hidden (None: none) -> h (T, B, 256), new hidden (one tensor)."""
+        """The next T steps x (T, B, .), GRU state before (None: at the start) -> h (T, B, 256), GRU state after."""
         output, hidden = self.gru(x, hidden)
         return self.out(torch.cat([output, x], -1)), hidden
 
 
 def chrono_init(gru: nn.GRU, steps: int) -> None:
     """Let the GRU begin with time constants of 2 to steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
-    gate = slice(gru.hidden_size, 2 * gru.hidden_size)  # after the reset gate; h' = (1 - gate) n + gate h
+    # PyTorch's order is reset, update, new; h' = (1 - update) * new + update * h
+    update = slice(gru.hidden_size, 2 * gru.hidden_size)
     for layer in range(gru.num_layers):
         with torch.no_grad():
-            getattr(gru, f"bias_ih_l{layer}")[gate] = torch.empty(gru.hidden_size).uniform_(1, steps - 1).log()
-            getattr(gru, f"bias_hh_l{layer}")[gate] = 0
+            getattr(gru, f"bias_ih_l{layer}")[update] = torch.empty(gru.hidden_size).uniform_(1, steps - 1).log()
+            getattr(gru, f"bias_hh_l{layer}")[update] = 0
 
 
 class BelieverBelief(nn.Module):
@@ -819,12 +820,12 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         self.poses = {}
         task_evaluate = self.task.evaluate
 
+        # ManiSkill calls evaluate after the physics and before the picture. MIKASA's tasks hide objects there, at
+        # z = 1000. On physx_cpu they would stay there: note their poses; _view takes the picture and restores them.
         def evaluate_and_note_poses() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
 
-        # Reset and step call the task's evaluate, which hides objects at z = 1000. On physx_cpu they would stay there:
-        # note where they were; _view takes the picture and puts them back before the next physics step.
         if not self.task.gpu_sim_enabled:
             self.task.evaluate = evaluate_and_note_poses
         self.task.update_obs_space(common.to_cpu_tensor(self.reset()[0]))  # adds rgb
@@ -869,12 +870,13 @@ def shaders_without_brdf_table() -> Iterator[None]:
 
 
 def decimate_meshes(task: gym.Env, triangles: int) -> None:
-    """Draw the robot with about so many triangles per mesh; all else is drawn as it is.
+    """Draw each mesh of the robot with about the given number of triangles at most; all else is drawn as it is.
 
-    The Panda and its camera have half a million, nine tenths of a step on a CPU, for 128 x 128 pixels.
+    The Panda and its camera have half a million triangles; drawing them takes nine tenths of a step on a CPU.
     """
     for link in task.agent.robot.get_links():
-        entities, meshes = [body.entity for body in link._objs], []  # one per scene
+        entities = [body.entity for body in link._objs]  # one per scene
+        meshes = []
         old = entities[0].find_component_by_type(RenderBodyComponent)
         if old is None:
             continue
@@ -898,7 +900,7 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
-    """Build one ManiSkill environment: on physx_cuda tensors of num_scenes, on physx_cpu numpy arrays of one scene."""
+    """Build an environment: on physx_cuda a batch of num_scenes scenes, with tensors; else one scene, with arrays."""
     if multiprocessing.parent_process():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
     with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
@@ -975,8 +977,8 @@ def parse_args() -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")
-    if "/" in args.exp_name:
-        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
+    if set("/{}") & set(args.exp_name):
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without / and braces")
     for name, value in asdict(args).items():
         flag = f"--{name.replace('_', '-')} {value}"
         low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
@@ -984,8 +986,8 @@ def parse_args() -> Args:
             bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
             fail(f"{flag} must be {bounds}")
         try:
-            str(value).format(**vars(args))
-        except (IndexError, KeyError, ValueError):
+            str(value).format(**vars(args))  # paths may contain {env_id} and {seed}
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
             fail(f"{flag} has braces around what is no argument's name; {{env_id}} and {{seed}} are")
     if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
@@ -1010,19 +1012,19 @@ def check_run(args: Args) -> Path:
 
 
 def open_run(path: Path, args: Args) -> None:
-    """Make the run's directory, for this process alone as long as it lives, once all inputs have been read.
+    """Make the run's directory and lock it until this process ends; fails when another process holds the lock.
 
-    With --overwrite what it holds is deleted. Fails when another process works there.
+    With --overwrite all that it holds is deleted, so call this only when all inputs have been read.
     """
-    recorded = path / "args.json"
+    args_file = path / "args.json"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
         if args.overwrite:
-            save(recorded, b"{}")  # what a kill leaves half deleted must not be resumed
-            for file in set(path.iterdir()) - {recorded}:
+            save(args_file, b"{}")  # if the deletion is interrupted, check_run finds this and refuses to resume
+            for file in set(path.iterdir()) - {args_file}:
                 shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
-        save(recorded, json.dumps(asdict(args), indent=2).encode())
+        save(args_file, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
 
@@ -1041,8 +1043,8 @@ def save(path: Path, content: dict | bytes) -> None:
 def load(path: Path, hint: str, **expected: object) -> dict:
     """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
     if not path.exists():
-        fail(f"{path} does not exist")
-    expected["format"] = FORMAT
+        fail(f"{path} does not exist; run the script that writes it first, or correct the path")
+    expected = {"format": FORMAT, **expected}  # first, as another format explains all other differences
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         found = {name: content.get(name) for name in expected}
@@ -1070,7 +1072,7 @@ def run_stage(script: str, args: Args) -> None:
     try:
         stage.wait()
     except KeyboardInterrupt:
-        stage.wait()  # Ctrl-C reaches the stage, too, and the stage says so
+        sys.exit(stage.wait() or 1)  # Ctrl-C has reached the stage, too, and the stage has said so
     if stage.returncode:
         sys.exit(stage.returncode)
 
@@ -1083,4 +1085,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; training resumes from its last checkpoint with the same command, without --overwrite")
+        sys.exit("\nstopped; the same command, without --overwrite, goes on from what was saved last")

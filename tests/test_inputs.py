@@ -120,7 +120,9 @@ def test_a_folder_that_cannot_be_written() -> None:
             ["--belief", "runs/{env}__aib_belief__1/belief.pt"],
             ["--belief runs/{env}__", "{env_id} and {seed}"],
         ),
+        ("ppo_aib", ["--exp-name", "{seed}"], ["--exp-name {seed}", "without / and braces"]),
         ("aib_belief", ["--repr-dir", "runs/{"], ["--repr-dir runs/{ has braces"]),
+        ("ppo_aib", ["--belief", "{seed.x}"], ["--belief {seed.x} has braces"]),
         ("ppo_baseline", ["--device", "cuda"], ["no CUDA device", "--device cpu"]),
     ],
 )
@@ -287,7 +289,7 @@ def test_bad_files_and_arguments(folder: Path, capfd: pytest.CaptureFixture, nam
         (b"hello", ["is damaged"]),
         (pickle.dumps(Payload()), ["is damaged"]),
         ({"format": ppo_baseline.FORMAT, "kind": "x", "code": Payload()}, ["is damaged"]),
-        ({"format": 99, "kind": "x"}, ["has format 99"]),
+        ({"format": 99, "kind": "y"}, ["has format 99"]),
         ({"format": ppo_baseline.FORMAT, "kind": "y"}, ["has kind y, this run needs x"]),
         ([1, 2], ["is damaged"]),
     ],
