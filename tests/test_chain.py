@@ -110,6 +110,7 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
     assert json.dumps(metrics, indent=2) in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
+@pytest.mark.thorough
 def test_an_agent_is_diagnosed_and_nothing_is_written(
     quick_runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -136,6 +137,7 @@ def test_an_agent_is_diagnosed_and_nothing_is_written(
     refused("needs an agent with a belief", diagnose_agent.Args(plain, swap_particles=True))
 
 
+@pytest.mark.thorough
 def test_reach_plays_every_second_scene_anew_and_stage_2_takes_it(
     quick_runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
