@@ -371,11 +371,11 @@ def rollout(
 ) -> dict[str, Tensor]:
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
-    Returns tensors (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; and values (T+1, N),
-    V(o_T) last; if deterministic also the privileged state, which the evaluation compares the belief with.
-    The particles are kept because fresh ones would change the probability ratio of the update. Episodes are played in
-    rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the size of a round changes
-    results by rounding only.
+    Episodes are played in rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the size
+    of a round changes results by rounding only.
+    Returns tensors (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; values (T+1, N), V(o_T) last;
+    particles, as fresh ones would change the probability ratio of the update; if deterministic also the privileged
+    state, which the evaluation compares the belief with.
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
@@ -467,8 +467,7 @@ def evaluate(
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    u_r2, u_r2_at_end: R2 of u = phi(s) from the mean particle in the states that this agent visits, over all steps and
-    at the last one. Beliefs are trained on a random policy's episodes, so it may fall as the agent learns.
+    u_r2, u_r2_at_end: R2 of u = phi(s) from the mean particle on these episodes, over all steps and at the last one.
     """
     torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)

@@ -262,9 +262,9 @@ def rollout(
 ) -> dict[str, Tensor]:
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
-    Returns tensors (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; and values (T+1, N), V(o_T)
-    last. Episodes are played in rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the
-    size of a round changes results by rounding only.
+    Episodes are played in rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the size
+    of a round changes results by rounding only.
+    Returns tensors (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; values (T+1, N), V(o_T) last.
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
