@@ -678,4 +678,4 @@ if __name__ == "__main__":
     try:
         main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, goes on from what was saved last")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from what was saved last")

@@ -127,7 +127,7 @@ class Args:
     amp: bool = False
     """image network in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint; task, networks, image_size, robot_triangles and num_envs are those stored in it"""
+    """only evaluate --checkpoint; it keeps its task, image_size, robot_triangles, num_envs and amp"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
@@ -248,7 +248,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); from T = 30 on N(0, 1) within 1 %."""
+    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); if T >= 30, its std is 1 within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     # the package's scale leaves out the power at f = 0: correct it
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))
@@ -274,12 +274,12 @@ def rollout(
     noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     desc = "evaluation" if deterministic else "rollout"
-    for first in tqdm(range(0, num_episodes, envs.num_envs), desc, unit="round", leave=False):
+    for first in range(0, num_episodes, envs.num_envs):
         # the last round is filled up with repeated episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
         kept = rows[: num_episodes - first]
         obs, info = envs.reset(seed=seeds[rows].tolist())
-        for t in range(steps + 1):
+        for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
             step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
             dist, values = agent(step)
             buffer["values"][t, kept] = values[: len(kept)]
@@ -312,11 +312,11 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
-    rgb = np.array(buffer["rgb"][:, :4].cpu())
+    rgb = np.array(buffer["rgb"][:, :4].cpu())  # (T, 4, H, W, 3), a copy
     succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
-    rgb[1:, :, :4][succeeded] = (0, 255, 0)
+    rgb[1:, :, :4][succeeded] = (0, 255, 0)  # the top 4 rows of pixels
     rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)
-    size = ["-vf", "scale=-2:256:flags=neighbor"]  # 256 pixels high, and as wide as that makes it, to an even number
+    size = ["-vf", "scale=-2:256:flags=neighbor"]  # 256 pixels high; -2: width in proportion, rounded to even
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1, output_params=size)
 
 
@@ -394,7 +394,7 @@ def main(args: Args) -> None:
         buffer = rollout(envs, agent, args, seeds)
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
 
-        values, rewards = buffer.pop("values"), buffer["rewards"]
+        values, rewards = buffer.pop("values"), buffer["rewards"]  # values has T+1 steps: not for the batch
         if args.reward_norm:  # with values 0 and lambda 1 compute_gae gives the discounted sums of the rewards to come
             sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
             reward_var += (sums.var().item() - reward_var) / iteration  # mean over iterations
@@ -714,4 +714,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, goes on from what was saved last")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from what was saved last")

@@ -176,7 +176,7 @@ class Args:
     amp: bool = False
     """image networks of policy and belief in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint; task, networks, image_size, robot_triangles and num_envs are those stored in it"""
+    """only evaluate --checkpoint; it keeps its task, image_size, robot_triangles, num_envs, amp and particles"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
     """the agent that --evaluate evaluates"""
 
@@ -468,7 +468,7 @@ def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); from T = 30 on N(0, 1) within 1 %."""
+    """Noise (..., T) with spectrum 1/f**beta over time (Eberhard et al., 2023); if T >= 30, its std is 1 within 1 %."""
     noise = colorednoise.powerlaw_psd_gaussian(beta, shape, random_state=rng)
     # the package's scale leaves out the power at f = 0: correct it
     frequencies = np.abs(np.fft.fftfreq(shape[-1]))
@@ -484,9 +484,8 @@ def rollout(
 
     Episodes are played in rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the size
     of a round changes results by rounding only.
-    Returns tensors (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; values (T+1, N), V(o_T) last;
-    particles, as fresh ones would change the probability ratio of the update; if deterministic also the privileged
-    state, which the evaluation compares the belief with.
+    Returns tensors (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; if deterministic
+    also the privileged state, for the evaluation of the belief; and values (T+1, N), V(o_T) last.
     """
     num_episodes = len(seeds)
     steps = gym.spec(args.env_id).max_episode_steps
@@ -501,17 +500,18 @@ def rollout(
         u_noise.zero_()
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     desc = "evaluation" if deterministic else "rollout"
-    for first in tqdm(range(0, num_episodes, envs.num_envs), desc, unit="round", leave=False):
+    for first in range(0, num_episodes, envs.num_envs):
         # the last round is filled up with repeated episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
         kept = rows[: num_episodes - first]
         obs, info = envs.reset(seed=seeds[rows].tolist())
         hidden = None
-        for t in range(steps + 1):
+        for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
             step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
             x = agent.belief.history.embed(step["rgb"], step["joints"])
             h, hidden = agent.belief.history(x[None], hidden)
             p_u = agent.belief.decode(h[0], z_noise[t, rows])
+            # kept for the update: fresh particles would change its probability ratio
             step["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
             dist, values = agent(step)
             buffer["values"][t, kept] = values[: len(kept)]
@@ -564,11 +564,11 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
-    rgb = np.array(buffer["rgb"][:, :4].cpu())
+    rgb = np.array(buffer["rgb"][:, :4].cpu())  # (T, 4, H, W, 3), a copy
     succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
-    rgb[1:, :, :4][succeeded] = (0, 255, 0)
+    rgb[1:, :, :4][succeeded] = (0, 255, 0)  # the top 4 rows of pixels
     rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)
-    size = ["-vf", "scale=-2:256:flags=neighbor"]  # 256 pixels high, and as wide as that makes it, to an even number
+    size = ["-vf", "scale=-2:256:flags=neighbor"]  # 256 pixels high; -2: width in proportion, rounded to even
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1, output_params=size)
 
 
@@ -583,7 +583,7 @@ def evaluate(
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
 
-    u_r2, u_r2_at_end: R2 of u = phi(s) from the mean particle on these episodes, over all steps and at the last one.
+    u_r2, u_r2_at_end: R2 of u = phi(s) from the mean particle, over all steps and before the last action.
     """
     torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
@@ -719,7 +719,7 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     agent = Agent(envs, BelieverBelief(stored["config"], args.amp), args).to(args.device)
     agent.belief.load_state_dict(stored["belief"])
-    others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]  # the belief's stay as they are
+    others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]  # the belief's get no gradient
     cnn = {"params": agent.cnn.parameters(), "lr": args.cnn_lr_scale * args.learning_rate}
     optimizer = torch.optim.Adam([cnn, {"params": others}], lr=args.learning_rate, eps=1e-5, fused=True)
     completed, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
@@ -743,7 +743,7 @@ def main(args: Args) -> None:
         buffer = rollout(envs, agent, args, seeds)
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
 
-        values, rewards = buffer.pop("values"), buffer["rewards"]
+        values, rewards = buffer.pop("values"), buffer["rewards"]  # values has T+1 steps: not for the batch
         if args.reward_norm:  # with values 0 and lambda 1 compute_gae gives the discounted sums of the rewards to come
             sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
             reward_var += (sums.var().item() - reward_var) / iteration  # mean over iterations
@@ -1084,4 +1084,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, goes on from what was saved last")
+        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from what was saved last")

@@ -244,5 +244,5 @@ def test_real_workers_end_with_their_parent_killed_or_stopped(tmp_path: Path) ->
         wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 20)  # noqa: B023
         if number == signal.SIGINT:
             said = [line for line in err.splitlines() if line.strip() and "%|" not in line]  # no progress bars
-            stopped = "stopped; the same command, without --overwrite, goes on from what was saved last"
+            stopped = "stopped; the same command, without --overwrite, resumes a run from what was saved last"
             assert process.returncode == 1 and said == [stopped]
