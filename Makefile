@@ -1,7 +1,7 @@
 # make run: set everything up, then train AIB on InterceptFast (a --quick trial where there is no CUDA device)
 # make demo: set everything up, then train AIB on RememberColor3 with --small, and draw its curve
 # make test: set everything up, then lint and run the tests
-# make test-all: all tests, with every kill of every stage, reach.py, diagnose_agent.py and three seeds of learning
+# make test-all: all tests, with every kill of every stage, diagnose_agent.py and three seeds of learning
 # make test-gpu: the three PPO scripts' --quick on a GPU, with physics there and then on the CPU
 # make bench: speed, as ratios measured in one run
 SHELL := /bin/bash

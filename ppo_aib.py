@@ -54,7 +54,7 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
+FORMAT = 8  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
@@ -136,14 +136,12 @@ class Args:
     """episodes per evaluation, always the same ones; --evaluate plays others"""
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
-    final_std: float | None = None
-    """standard deviation at the end of total_timesteps, reached linearly; None: it is learnt"""
     noise_beta: float = 0.0
     """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, 1 is pink"""
     joints_norm: bool = False
     """standardise the policy's joints by their running mean and standard deviation"""
     amp: bool = False
-    """image networks of policy and belief in bfloat16"""
+    """image network of the policy in bfloat16"""
     evaluate: bool = False
     """only evaluate --checkpoint; it keeps its task, image_size, robot_triangles, num_envs, amp and particles"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
@@ -153,7 +151,7 @@ class Args:
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
 LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
-LIMITS |= dict(init_std=(0.001, math.inf), final_std=(0.001, math.inf))
+LIMITS |= dict(init_std=(0.001, math.inf))
 LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5, where it differs from the defaults above; any other task has InterceptFast-v0's, the defaults
@@ -239,44 +237,80 @@ class StateEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
+    """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
 
+    The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
+    it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
     The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
-    def __init__(self, config: dict, amp: bool = False):
+    def __init__(self, config: dict):
         super().__init__()
+        height, width, _ = config["image_shape"]
+        self.patch = min(height, width) // 16  # pixels
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
         self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
-        self.use_joints = config["joints_dim"] > 0
-        inputs = 512 + config["joints_dim"]
-        self.cnn = orthogonal_init(NatureCNN(config["image_shape"], 512, amp))
-        self.gru = nn.GRU(inputs, 256, config["gru_layers"])
-        self.out = mlp([256 + inputs, 256, 256])
+        lines = [torch.linspace(-1, 1, length // self.patch) for length in (height, width)]
+        self.register_buffer("coordinates", torch.cartesian_prod(*lines))
+        self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
+        self.heads = nn.Linear(64, 16 + 8 + 32)
+        self.code = nn.Linear(256, 16)
+        self.query = orthogonal_init(mlp([16, 64, 16]))
+        self.place = orthogonal_init(mlp([2 + 8, 64, 64]))
+        self.out = orthogonal_init(mlp([16 + 64, 256, 256]))
+        self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
+        self.gru = nn.GRUCell(32 + 2 + 8, 256)
 
-    def embed(self, rgb: Tensor, joints: Tensor) -> Tensor:
-        """Images (B, H, W, 3) uint8 and joints (B, J) -> the GRU's input x (B, 512 + J), or (B, 512) without joints."""
-        x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
-        return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
+    def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+        """Images (B, H, W, 3) uint8 -> keys (B, N, 16) and contents (B, N, 10) of N patches, summary (B, 32).
 
-    def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The next T steps x (T, B, .), GRU state before (None: at the start) -> h (T, B, 256), GRU state after."""
-        output, hidden = self.gru(x, hidden)
-        return self.out(torch.cat([output, x], -1)), hidden
+        Contents are coordinates and values. mask: share of the blocks of 2 x 2 pixels that are replaced by the mean.
+        """
+        images = rgb.float().sub_(self.image_mean).div_(self.image_std)
+        if mask:
+            batch, height, width = rgb.shape[0], rgb.shape[1] // 2, rgb.shape[2] // 2  # in blocks
+            kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
+            images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
+        # a convolution whose kernel and stride are a patch, as a linear layer
+        rows = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch)
+        tokens = self.token(rows.flatten(1, 2).flatten(2))
+        keys, values, features = self.heads(tokens).split([16, 8, 32], -1)
+        contents = torch.cat([self.coordinates.expand(len(rgb), -1, -1), values], -1)
+        return nn.functional.layer_norm(keys, [16]), contents, features.relu().amax(1)
+
+    def attend(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
+        """Memory (B, 16) asks patches (B, N, .) -> expected contents (B, 10), logarithms of the weights (B, N)."""
+        query = nn.functional.layer_norm(self.query(memory), [16])
+        log_weights = (keys @ query.unsqueeze(-1)).squeeze(-1).log_softmax(-1)
+        return (log_weights.exp().unsqueeze(-2) @ contents).squeeze(-2), log_weights
+
+    def combine(self, memory: Tensor, place: Tensor, joints: Tensor) -> Tensor:
+        """h (..., 256) of memory (..., 16), place (..., 10) and joints (..., J)."""
+        arm = self.arm((joints - self.joints_mean) / self.joints_std)
+        return self.out(torch.cat([memory, self.place(place)], -1)) + arm
+
+    def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
+        if hidden is None:
+            hidden = joints.new_zeros(len(rgb), 256)
+        keys, contents, summary = self.look(rgb)
+        memory = self.code(hidden)
+        place, _ = self.attend(memory, keys, contents)
+        return self.combine(memory, place, joints), self.gru(torch.cat([summary, place], -1), hidden)
 
 
 class AIBBelief(nn.Module):
     """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2).
 
-    config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
+    config: image_shape [H, W, 3], joints_dim, state_dim, u_dim, z_dim.
     """
 
-    def __init__(self, config: dict, amp: bool = False):
+    def __init__(self, config: dict):
         super().__init__()
         self.config = config
-        self.history = HistoryEncoder(config, amp)
+        self.history = HistoryEncoder(config)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
         self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss; only PPO's evaluations use it
@@ -397,9 +431,8 @@ def rollout(
         hidden = None
         for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
             step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
-            x = agent.belief.history.embed(step["rgb"], step["joints"])
-            h, hidden = agent.belief.history(x[None], hidden)
-            p_u = agent.belief.decode(h[0], z_noise[t, rows])
+            h, hidden = agent.belief.history(step["rgb"], step["joints"], hidden)
+            p_u = agent.belief.decode(h, z_noise[t, rows])
             # kept for the update: fresh particles would change its probability ratio
             step["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
             dist, values = agent(step)
@@ -489,7 +522,7 @@ def evaluate_checkpoint(args: Args) -> None:
         setattr(args, name, stored[name])
     check_task(args)
     envs = make_envs(args)
-    agent = Agent(envs, AIBBelief(stored["config"], args.amp), args).to(args.device)
+    agent = Agent(envs, AIBBelief(stored["config"]), args).to(args.device)
     agent.load_state_dict(stored["agent"])
     metrics, video = evaluate(envs, agent, args, TEST_SEED)
     metrics |= {"global_step": stored["global_step"], "num_eval_episodes": args.num_eval_episodes}
@@ -523,7 +556,7 @@ def main(args: Args) -> None:
 
     envs = make_envs(args)
     torch.manual_seed(args.seed)
-    agent = Agent(envs, AIBBelief(stored["config"], args.amp), args).to(args.device)
+    agent = Agent(envs, AIBBelief(stored["config"]), args).to(args.device)
     agent.belief.load_state_dict(stored["belief"])
     others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]  # the belief's get no gradient
     cnn = {"params": agent.cnn.parameters(), "lr": args.cnn_lr_scale * args.learning_rate}
@@ -541,9 +574,6 @@ def main(args: Args) -> None:
     for iteration in bar:
         start = time.time()
         global_step = iteration * batch_size  # after this iteration
-        if args.final_std is not None:
-            std = args.init_std + (args.final_std - args.init_std) * iteration / num_iterations
-            agent.log_std.requires_grad_(False).fill_(math.log(std))
         torch.manual_seed(args.seed * 1_000_000 + iteration)  # so that a resumed run repeats the iteration
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
         buffer = rollout(envs, agent, args, seeds)

@@ -44,7 +44,7 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
+FORMAT = 8  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
@@ -118,8 +118,6 @@ class Args:
     """episodes per evaluation, always the same ones; --evaluate plays others"""
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
-    final_std: float | None = None
-    """standard deviation at the end of total_timesteps, reached linearly; None: it is learnt"""
     noise_beta: float = 0.0
     """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, 1 is pink"""
     joints_norm: bool = False
@@ -135,7 +133,7 @@ class Args:
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
 LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
-LIMITS |= dict(init_std=(0.001, math.inf), final_std=(0.001, math.inf))
+LIMITS |= dict(init_std=(0.001, math.inf))
 LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5, where it differs from the defaults above; any other task has InterceptFast-v0's, the defaults
@@ -386,9 +384,6 @@ def main(args: Args) -> None:
     for iteration in bar:
         start = time.time()
         global_step = iteration * batch_size  # after this iteration
-        if args.final_std is not None:
-            std = args.init_std + (args.final_std - args.init_std) * iteration / num_iterations
-            agent.log_std.requires_grad_(False).fill_(math.log(std))
         torch.manual_seed(args.seed * 1_000_000 + iteration)  # so that a resumed run repeats the iteration
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
         buffer = rollout(envs, agent, args, seeds)

@@ -44,7 +44,6 @@ import mikasa_robo_suite.rl.memory_envs  # noqa: F401  (registers the tasks)
 import numpy as np
 import sapien
 import torch
-import torch.utils.checkpoint
 import trimesh
 import tyro
 from mani_skill.utils import assets, common, registration, wrappers
@@ -55,9 +54,9 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 7  # of every .pt file and of dataset/; other formats are refused
-CNN_CHUNK = 2048  # images through a belief's CNN at a time; their activations take 1 to 2 GB
+FORMAT = 8  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
+IMAGE_CHUNK = 4096 if CUDA else 64  # images through the history encoder at a time: what a CPU's cache holds
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
     BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
@@ -106,26 +105,16 @@ class Args:
     """whole episodes per update of the belief"""
     belief_lr: float = 3e-4
     """Adam's learning rate for the belief"""
-    belief_anneal: bool = False
-    """let belief_lr fall linearly to 0 over the second half of the updates"""
     z_dim: int = 32
     """size of z"""
     beta: float = 1.0
     """weight of KL(q || N(0, I))"""
-    bptt_steps: int | None = None
-    """cut back-propagation through time after this many steps; None: never"""
-    image_norm: Literal["mean", "none"] = "mean"
-    """subtract the dataset's mean image and divide by the std of what is left, one number; or divide by 255"""
-    chrono_init: bool = True
-    """GRU gates that start out remembering for up to an episode (Tallec and Ollivier, 2018)"""
-    gru_layers: int = 1
-    """layers of the GRU"""
-    history_joints: bool = True
-    """joints in the history, as in the paper; its authors' code has the image alone"""
-    image_shift: int = 0
-    """shift each episode's images by up to this many pixels while the belief is trained, against overfitting"""
-    belief_amp: bool = BFLOAT16
-    """image network in bfloat16 in the training of the belief and its validation"""
+    image_mask: float = 0.5
+    """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
+    warmup_updates: int = 0
+    """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
+    prior_nll: float = 0.0
+    """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
     val_every: int = 50
     """updates between checkpoints, each with a validation"""
 
@@ -167,14 +156,12 @@ class Args:
     """episodes per evaluation, always the same ones; --evaluate plays others"""
     init_std: float = math.exp(-0.5)
     """standard deviation of the actions at the start"""
-    final_std: float | None = None
-    """standard deviation at the end of total_timesteps, reached linearly; None: it is learnt"""
     noise_beta: float = 0.0
     """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, 1 is pink"""
     joints_norm: bool = False
     """standardise the policy's joints by their running mean and standard deviation"""
     amp: bool = False
-    """image networks of policy and belief in bfloat16"""
+    """image network of the policy in bfloat16"""
     evaluate: bool = False
     """only evaluate --checkpoint; it keeps its task, image_size, robot_triangles, num_envs, amp and particles"""
     checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
@@ -184,9 +171,9 @@ class Args:
 # (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
 LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
 LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
-LIMITS |= dict(init_std=(0.001, math.inf), final_std=(0.001, math.inf))
+LIMITS |= dict(init_std=(0.001, math.inf))
 LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
-LIMITS |= dict(image_shift=(0, math.inf))
+LIMITS |= dict(image_mask=(0, 1), warmup_updates=(0, math.inf))
 MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5, where it differs from the defaults above; any other task has InterceptFast-v0's, the defaults
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
@@ -195,7 +182,8 @@ TASKS = {  # Table 5, where it differs from the defaults above; any other task h
 SMALL = dict(exp_name="ppo_believer_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, reward_norm=True, joints_norm=True)
 SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
-SMALL |= dict(num_episodes=640, num_updates=600, batch_episodes=16, belief_lr=1e-3)
+SMALL |= dict(num_episodes=640, num_updates=1500, batch_episodes=16, belief_lr=2e-3)
+SMALL |= dict(warmup_updates=4000, prior_nll=1.0, val_every=250)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
 QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
 QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_episodes=8, num_updates=4, batch_episodes=4)
@@ -271,54 +259,113 @@ class StateEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the observations o_0, ..., o_t (paper 3.2): NatureCNN, GRU, MLP of the GRU's output and its input.
+    """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
 
+    The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
+    it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
     The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
-    def __init__(self, config: dict, amp: bool = False):
+    def __init__(self, config: dict):
         super().__init__()
+        height, width, _ = config["image_shape"]
+        self.patch = min(height, width) // 16  # pixels
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
         self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
-        self.use_joints = config["joints_dim"] > 0
-        inputs = 512 + config["joints_dim"]
-        self.cnn = orthogonal_init(NatureCNN(config["image_shape"], 512, amp))
-        self.gru = nn.GRU(inputs, 256, config["gru_layers"])
-        self.out = mlp([256 + inputs, 256, 256])
+        lines = [torch.linspace(-1, 1, length // self.patch) for length in (height, width)]
+        self.register_buffer("coordinates", torch.cartesian_prod(*lines))
+        self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
+        self.heads = nn.Linear(64, 16 + 8 + 32)
+        self.code = nn.Linear(256, 16)
+        self.query = orthogonal_init(mlp([16, 64, 16]))
+        self.place = orthogonal_init(mlp([2 + 8, 64, 64]))
+        self.out = orthogonal_init(mlp([16 + 64, 256, 256]))
+        self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
+        self.gru = nn.GRUCell(32 + 2 + 8, 256)
 
-    def embed(self, rgb: Tensor, joints: Tensor) -> Tensor:
-        """Images (B, H, W, 3) uint8 and joints (B, J) -> the GRU's input x (B, 512 + J), or (B, 512) without joints."""
-        x = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
-        return torch.cat([x, (joints - self.joints_mean) / self.joints_std], -1) if self.use_joints else x
+    def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+        """Images (B, H, W, 3) uint8 -> keys (B, N, 16) and contents (B, N, 10) of N patches, summary (B, 32).
 
-    def forward(self, x: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The next T steps x (T, B, .), GRU state before (None: at the start) -> h (T, B, 256), GRU state after."""
-        output, hidden = self.gru(x, hidden)
-        return self.out(torch.cat([output, x], -1)), hidden
+        Contents are coordinates and values. mask: share of the blocks of 2 x 2 pixels that are replaced by the mean.
+        """
+        images = rgb.float().sub_(self.image_mean).div_(self.image_std)
+        if mask:
+            batch, height, width = rgb.shape[0], rgb.shape[1] // 2, rgb.shape[2] // 2  # in blocks
+            kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
+            images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
+        # a convolution whose kernel and stride are a patch, as a linear layer
+        rows = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch)
+        tokens = self.token(rows.flatten(1, 2).flatten(2))
+        keys, values, features = self.heads(tokens).split([16, 8, 32], -1)
+        contents = torch.cat([self.coordinates.expand(len(rgb), -1, -1), values], -1)
+        return nn.functional.layer_norm(keys, [16]), contents, features.relu().amax(1)
+
+    def attend(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
+        """Memory (B, 16) asks patches (B, N, .) -> expected contents (B, 10), logarithms of the weights (B, N)."""
+        query = nn.functional.layer_norm(self.query(memory), [16])
+        log_weights = (keys @ query.unsqueeze(-1)).squeeze(-1).log_softmax(-1)
+        return (log_weights.exp().unsqueeze(-2) @ contents).squeeze(-2), log_weights
+
+    def combine(self, memory: Tensor, place: Tensor, joints: Tensor) -> Tensor:
+        """h (..., 256) of memory (..., 16), place (..., 10) and joints (..., J)."""
+        arm = self.arm((joints - self.joints_mean) / self.joints_std)
+        return self.out(torch.cat([memory, self.place(place)], -1)) + arm
+
+    def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
+        if hidden is None:
+            hidden = joints.new_zeros(len(rgb), 256)
+        keys, contents, summary = self.look(rgb)
+        memory = self.code(hidden)
+        place, _ = self.attend(memory, keys, contents)
+        return self.combine(memory, place, joints), self.gru(torch.cat([summary, place], -1), hidden)
 
 
-def chrono_init(gru: nn.GRU, steps: int) -> None:
+class Teacher(nn.Module):
+    """The memory that an episode calls for, told by its first privileged state: u_0 (B, u_dim) -> memory (B, 16)."""
+
+    def __init__(self, u_dim: int):
+        super().__init__()
+        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)
+        self.net = orthogonal_init(mlp([u_dim, 64, 16]))
+
+    def forward(self, u_0: Tensor) -> Tensor:
+        return self.net(self.standardise(u_0))
+
+
+class Locator(nn.Module):
+    """What u is if a patch shows the object: contents (..., 10) -> Normal over u (..., u_dim), one std for all."""
+
+    def __init__(self, u_dim: int):
+        super().__init__()
+        self.mean = orthogonal_init(mlp([2 + 8, 64, u_dim]))
+        self.raw_std = nn.Parameter(torch.zeros(u_dim))
+
+    def forward(self, contents: Tensor) -> Normal:
+        return Normal(self.mean(contents), nn.functional.softplus(self.raw_std) + 0.1, validate_args=False)
+
+
+def chrono_init(gru: nn.GRUCell, steps: int) -> None:
     """Let the GRU begin with time constants of 2 to steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
     # PyTorch's order is reset, update, new; h' = (1 - update) * new + update * h
     update = slice(gru.hidden_size, 2 * gru.hidden_size)
-    for layer in range(gru.num_layers):
-        with torch.no_grad():
-            getattr(gru, f"bias_ih_l{layer}")[update] = torch.empty(gru.hidden_size).uniform_(1, steps - 1).log()
-            getattr(gru, f"bias_hh_l{layer}")[update] = 0
+    with torch.no_grad():
+        gru.bias_ih[update] = torch.empty(gru.hidden_size).uniform_(1, steps - 1).log()
+        gru.bias_hh[update] = 0
 
 
 class BelieverBelief(nn.Module):
     """b(h) of Believer: history encoder, fixed prior N(0, I) and decoder p(u|z,h).
 
-    config: image_shape [H, W, 3], joints_dim (0: none in the history), state_dim, gru_layers, u_dim, z_dim.
+    config: image_shape [H, W, 3], joints_dim, state_dim, u_dim, z_dim.
     """
 
-    def __init__(self, config: dict, amp: bool = False):
+    def __init__(self, config: dict):
         super().__init__()
         self.config = config
-        self.history = HistoryEncoder(config, amp)
+        self.history = HistoryEncoder(config)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
         self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss; only PPO's evaluations use it
 
@@ -359,32 +406,82 @@ class Agent(nn.Module):
 # ---------------------------------------------------------------- losses
 
 
-def encode_history(history: nn.Module, batch: dict[str, Tensor], bptt_steps: int | None = None) -> Tensor:
-    """h (T+1, B, 256) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J).
+def encode_history(
+    history: nn.Module, batch: dict[str, Tensor], mask: float = 0.0, teacher_memory: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """h (T+1, B, 256) and memory (T+1, B, 16) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J).
 
-    The frames go through the CNN in chunks, all but the last with gradient checkpointing. bptt_steps truncates
-    back-propagation through time.
+    teacher_memory (B, 16), if given, asks and answers in place of the memory, which is returned all the same.
     """
-    rgb, joints = batch["rgb"].flatten(0, 1), batch["joints"].flatten(0, 1)
-    *chunks, last = zip(rgb.split(CNN_CHUNK), joints.split(CNN_CHUNK), strict=True)
-    x = [torch.utils.checkpoint.checkpoint(history.embed, *chunk, use_reentrant=False) for chunk in chunks]
-    x = torch.cat([*x, history.embed(*last)]).unflatten(0, batch["rgb"].shape[:2])
-    outputs, hidden = [], None
-    for piece in x.split(bptt_steps or len(x)):
-        h, hidden = history(piece, hidden)
-        hidden = hidden.detach()
-        outputs.append(h)
-    return torch.cat(outputs)
+    seen = [history.look(rgb, mask) for rgb in batch["rgb"].flatten(0, 1).split(IMAGE_CHUNK)]
+    keys, contents, summary = (torch.cat(x).unflatten(0, batch["rgb"].shape[:2]) for x in zip(*seen, strict=True))
+    hidden, memories, places = batch["joints"].new_zeros(keys.shape[1], 256), [], []
+    for step in zip(keys, contents, summary, strict=True):
+        memories.append(history.code(hidden))
+        used = memories[-1] if teacher_memory is None else teacher_memory
+        place, _ = history.attend(used, *step[:2])
+        places.append(place)
+        hidden = history.gru(torch.cat([step[2], place], -1), hidden)
+    memory, place = torch.stack(memories), torch.stack(places)
+    used = memory if teacher_memory is None else teacher_memory.expand_as(memory)
+    return history.combine(used, place, batch["joints"]), memory
 
 
-def believer_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
+def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
+    """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
+
+    The teacher's memory of u_0, the privileged state at the episode's start, asks in place of the GRU's (as the first
+    phase of Kumar et al., 2021). error: of u from z ~ p(z). place: -log sum_i w_i N(u; locator(patch i)) over the
+    attention's weights w_i, which tells the attention where u says that the object is; locator: its error of u.
+    """
+    belief, u = model["belief"], batch["u"]
+    keys, contents, _ = belief.history.look(batch["rgb"], args.image_mask)
+    memory = model["teacher"](batch["u_0"])
+    place, log_weights = belief.history.attend(memory, keys, contents)
+    h = belief.history.combine(memory, place, belief.history.joints_mean)  # without joints, which identify an episode
+    decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device))
+    located = model["locator"](contents)
+    # the locator's mean is fitted at the attended place alone: fitted here, it could place objects anywhere
+    log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
+    losses = {"error": (decoded.mean.squeeze(-2) - u).square().sum(-1).mean()}
+    losses["locator"] = (model["locator"](place.detach()).mean - u).square().sum(-1).mean()
+    losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
+    losses["total"] = sum(losses.values())
+    return losses
+
+
+def history_losses(
+    model: nn.ModuleDict, batch: dict[str, Tensor], args: Args, teacher_acts: bool
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """h (T+1, B, 256) of whole episodes, and what trains it beside the ELBO; zeros where the arguments say so.
+
+    prior_nll: -log p(u|z,h) with z from the prior. memory: squared error of the memory from the teacher's.
+    teacher_acts: h is of the teacher's memory, the GRU's only follows it.
+    """
+    teacher_memory = model["teacher"](batch["u"][0]).detach()
+    h, memory = encode_history(
+        model["belief"].history, batch, args.image_mask, teacher_memory if teacher_acts else None
+    )
+    losses = {"prior_nll": h.new_zeros(()), "memory": h.new_zeros(())}
+    if args.prior_nll:
+        decoded = model["belief"].decode(h, torch.randn(*h.shape[:-1], 1, args.z_dim, device=h.device))
+        losses["prior_nll"] = -decoded.log_prob(batch["u"].unsqueeze(-2)).sum(-1).mean()
+    if args.warmup_updates:
+        losses["memory"] = (memory - teacher_memory).square().sum(-1).mean()
+    return h, losses
+
+
+def believer_losses(
+    model: nn.ModuleDict, batch: dict[str, Tensor], args: Args, teacher_acts: bool = False
+) -> dict[str, Tensor]:
     """-ELBO with the fixed prior and its terms, averaged over all steps of a batch of whole episodes."""
-    h = encode_history(model["belief"].history, batch, args.bptt_steps)
+    h, history = history_losses(model, batch, args, teacher_acts)
     q = model["posterior"](torch.cat([batch["u"], h], -1))
     decoded = model["belief"].decoder(torch.cat([q.rsample(), h], -1))
     nll = -decoded.log_prob(batch["u"]).sum(-1).mean()
     kl = kl_divergence(q, Normal(0.0, 1.0)).sum(-1).mean()
-    return {"nll": nll, "kl": kl, "total": nll + args.beta * kl}
+    total = nll + args.beta * kl + args.prior_nll * history["prior_nll"] + history["memory"]
+    return {"nll": nll, "kl": kl, **history, "total": total}
 
 
 def compute_gae(rewards: Tensor, values: Tensor, gamma: float, gae_lambda: float) -> Tensor:
@@ -438,12 +535,10 @@ class EpisodeDataset:
         batch = {name: x[index].to(self.device) for name, x in self.arrays.items()}
         return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
 
-
-def shift_images(rgb: Tensor, pixels: int, rng: np.random.Generator) -> None:
-    """Shift each episode's images rgb (T+1, B, H, W, 3) in place by up to this many pixels, wrapping at the edges."""
-    shifts = rng.integers(-pixels, pixels, (rgb.shape[1], 2), endpoint=True)
-    for images, shift in zip(rgb.unbind(1), shifts.tolist(), strict=True):
-        images.copy_(images.roll(shift, (1, 2)))
+    def frames(self, episode: np.ndarray, t: np.ndarray) -> dict[str, Tensor]:
+        """Single frames t (B,) of episodes (B,): rgb (B, H, W, 3), u, and u_0 of the episode's start (B, u_dim)."""
+        batch = {name: self.arrays[name][episode, t].to(self.device) for name in ("rgb", "u")}
+        return batch | {"u_0": self.arrays["u"][episode, 0].to(self.device)}
 
 
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
@@ -508,9 +603,8 @@ def rollout(
         hidden = None
         for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
             step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
-            x = agent.belief.history.embed(step["rgb"], step["joints"])
-            h, hidden = agent.belief.history(x[None], hidden)
-            p_u = agent.belief.decode(h[0], z_noise[t, rows])
+            h, hidden = agent.belief.history(step["rgb"], step["joints"], hidden)
+            p_u = agent.belief.decode(h, z_noise[t, rows])
             # kept for the update: fresh particles would change its probability ratio
             step["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
             dist, values = agent(step)
@@ -544,7 +638,7 @@ def validate_belief(belief: nn.Module, episodes: EpisodeDataset, index: np.ndarr
     u, estimate = [], []
     for chunk in np.array_split(index, math.ceil(len(index) / 16)):
         batch = episodes(chunk)
-        h = encode_history(belief.history, batch)
+        h = encode_history(belief.history, batch)[0]
         z_noise = torch.randn(*h.shape[:-1], num_particles, belief.config["z_dim"], device=h.device)
         decoded = belief.decode(h, z_noise)
         u.append(batch["u"])
@@ -605,23 +699,20 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
     sample = episodes(train[:1])
     config = {
         "image_shape": list(sample["rgb"].shape[2:]),
-        "joints_dim": sample["joints"].shape[-1] if args.history_joints else 0,
+        "joints_dim": sample["joints"].shape[-1],
         "state_dim": len(stored["phi"]["mean"]),
-        "gru_layers": args.gru_layers,
         "u_dim": stored["u_dim"],
         "z_dim": args.z_dim,
     }
     torch.manual_seed(args.seed)
-    model = nn.ModuleDict({"belief": BelieverBelief(config, args.belief_amp)})
+    model = nn.ModuleDict({"belief": BelieverBelief(config)})
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
+    model["teacher"], model["locator"] = Teacher(config["u_dim"]), Locator(config["u_dim"])
     model["belief"].phi.load_state_dict(stored["phi"])
     history = model["belief"].history
-    if args.chrono_init:
-        chrono_init(history.gru, len(sample["actions"]))
-    if args.image_norm == "mean":
-        history.image_mean, history.image_std = stored["norm"]["image_mean"], stored["norm"]["image_std"]
-    if args.history_joints:
-        history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
+    chrono_init(history.gru, len(sample["actions"]))
+    for name in ("image_mean", "image_std", "joints_mean", "joints_std"):
+        setattr(history, name, stored["norm"][name])
     model.to(args.device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     completed = 0
@@ -633,18 +724,22 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
         completed = checkpoint["update"]
         print(f"resuming {path} at update {completed}", flush=True)
     writer = SummaryWriter(path / "belief_events", purge_step=completed + 1)
-    updates = range(completed + 1, args.num_updates + 1)
-    bar = tqdm(updates, "belief", args.num_updates, initial=completed, unit="update")
+    num_updates = args.warmup_updates + args.num_updates
+    bar = tqdm(range(completed + 1, num_updates + 1), "belief", num_updates, initial=completed, unit="update")
 
     for update in bar:
         rng = np.random.default_rng([args.seed, update])
-        batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
-        if args.image_shift:
-            shift_images(batch["rgb"], args.image_shift, rng)
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
-        if args.belief_anneal:
-            optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - (update - 1) / args.num_updates))
-        losses = believer_losses(model, batch, args)
+        progress = (update - args.warmup_updates - 1) / args.num_updates
+        optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - progress))
+        model["teacher"].train(progress < 0)
+        if progress < 0:
+            episode = rng.choice(train, 8 * args.batch_episodes)
+            frames = episodes.frames(episode, rng.integers(len(sample["rgb"]), size=len(episode)))
+            losses = warmup_losses(model, frames, args)
+        else:
+            batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
+            losses = believer_losses(model, batch, args, teacher_acts=progress < 0.5)
         optimizer.zero_grad()
         losses["total"].backward()
         # one bad batch can erase what h remembers
@@ -654,7 +749,7 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
             for name, value in losses.items():
                 writer.add_scalar(f"belief/{name}", value, update)
 
-        if update % args.val_every == 0 or update == args.num_updates:
+        if update % args.val_every == 0 or update == num_updates:
             u, estimate = validate_belief(model["belief"], episodes, test_on)
             error = (u - estimate).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
@@ -679,7 +774,7 @@ def evaluate_checkpoint(args: Args) -> None:
         setattr(args, name, stored[name])
     check_task(args)
     envs = make_envs(args)
-    agent = Agent(envs, BelieverBelief(stored["config"], args.amp), args).to(args.device)
+    agent = Agent(envs, BelieverBelief(stored["config"]), args).to(args.device)
     agent.load_state_dict(stored["agent"])
     metrics, video = evaluate(envs, agent, args, TEST_SEED)
     metrics |= {"global_step": stored["global_step"], "num_eval_episodes": args.num_eval_episodes}
@@ -717,7 +812,7 @@ def main(args: Args) -> None:
 
     envs = make_envs(args)
     torch.manual_seed(args.seed)
-    agent = Agent(envs, BelieverBelief(stored["config"], args.amp), args).to(args.device)
+    agent = Agent(envs, BelieverBelief(stored["config"]), args).to(args.device)
     agent.belief.load_state_dict(stored["belief"])
     others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]  # the belief's get no gradient
     cnn = {"params": agent.cnn.parameters(), "lr": args.cnn_lr_scale * args.learning_rate}
@@ -735,9 +830,6 @@ def main(args: Args) -> None:
     for iteration in bar:
         start = time.time()
         global_step = iteration * batch_size  # after this iteration
-        if args.final_std is not None:
-            std = args.init_std + (args.final_std - args.init_std) * iteration / num_iterations
-            agent.log_std.requires_grad_(False).fill_(math.log(std))
         torch.manual_seed(args.seed * 1_000_000 + iteration)  # so that a resumed run repeats the iteration
         seeds = (args.seed * 1_000_000 + iteration * args.num_envs + np.arange(args.num_envs)) % 2**30
         buffer = rollout(envs, agent, args, seeds)

@@ -15,18 +15,15 @@ PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num
 PPO |= dict(joints_norm=True, reward_norm=True)
 SIZES = {
     "aib_repr": dict(num_episodes=12, val_fraction=0.34, epochs=3, batch_size=30, num_workers=2),
-    "aib_belief": dict(
-        num_episodes=12, num_updates=6, batch_episodes=4, val_every=2, image_shift=2, belief_anneal=True
-    ),
+    "aib_belief": dict(num_episodes=12, warmup_updates=2, num_updates=4, batch_episodes=4, val_every=2, prior_nll=1.0),
     "ppo_aib": dict(num_episodes=12, total_timesteps=240, **PPO),
     "ppo_believer": dict(
         num_episodes=12,
         total_timesteps=160,
-        num_updates=4,
+        warmup_updates=2,
+        num_updates=2,
         batch_episodes=4,
         val_every=2,
-        image_shift=2,
-        belief_anneal=True,
         **PPO,
     ),
     "ppo_baseline": dict(total_timesteps=240, **PPO),
@@ -39,8 +36,8 @@ KILLS = [  # script, what it was doing, the moment
     ("aib_repr", "stage 1, in the second epoch", "repr_losses:6"),
     ("aib_repr", "stage 1, held-out losses", "repr_losses:4"),
     ("aib_repr", "renaming a checkpoint", "os.replace:9"),
-    ("aib_belief", "stage 2, first update", "belief_losses:1"),
-    ("aib_belief", "stage 2, between checkpoints", "belief_losses:4"),
+    ("aib_belief", "stage 2, first update", "warmup_losses:1"),
+    ("aib_belief", "stage 2, between checkpoints", "belief_losses:2"),
     ("aib_belief", "stage 2, held-out look", "encode:2"),
     ("aib_belief", "writing a checkpoint", "torch.save:2"),
     ("aib_belief", "stage 2, diagnostics", "probe_belief:1"),
@@ -51,7 +48,7 @@ KILLS = [  # script, what it was doing, the moment
     ("ppo_aib", "PPO, making a video", "make_video:2"),
     ("ppo_aib", "PPO, writing agent.pt", "torch.save:3"),
     ("ppo_aib", "PPO, renaming eval.csv", "os.replace:6"),
-    ("ppo_believer", "Believer, its belief", "believer_losses:3"),
+    ("ppo_believer", "Believer, its belief", "believer_losses:1"),
     ("ppo_believer", "Believer, PPO update", "ppo_losses:9"),
     ("ppo_baseline", "plain PPO, second rollout", "env.step:62"),
 ]

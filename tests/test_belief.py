@@ -110,23 +110,38 @@ def test_believers_belief_gets_the_episodes_phi_and_statistics_of_aibs(
 
 
 @pytest.mark.parametrize("script", ["aib_belief", "ppo_believer"])
-def test_belief_anneal_lets_the_learning_rate_fall_over_the_second_half(
+def test_warm_up_then_the_teacher_acts_then_the_memory(
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
 ) -> None:
-    rates, step = [], torch.optim.Adam.step
+    module, rates, order, step = SCRIPTS[script], [], [], torch.optim.Adam.step
     monkeypatch.setattr(torch.optim.Adam, "step", lambda self: (rates.append(self.param_groups[0]["lr"]), step(self)))
-    sizes = dict(num_episodes=20, num_updates=6, batch_episodes=4, belief_lr=1e-3, belief_anneal=True)
+    warmup_losses, encode_history = module.warmup_losses, module.encode_history
+
+    def noted_warmup(model: torch.nn.ModuleDict, frames: dict, args: object) -> dict:
+        assert frames["rgb"].shape == (32, 36, 36, 3) and model["teacher"].training
+        order.append("warm-up")
+        return warmup_losses(model, frames, args)
+
+    def noted_history(history: torch.nn.Module, batch: dict, *options: object) -> tuple:
+        if options:  # not a validation
+            order.append("memory" if options[1] is None else "teacher")
+        return encode_history(history, batch, *options)
+
+    monkeypatch.setattr(module, "warmup_losses", noted_warmup)
+    monkeypatch.setattr(module, "encode_history", noted_history)
+    sizes = dict(num_episodes=20, warmup_updates=2, num_updates=4, batch_episodes=4, belief_lr=1e-3)
     if script == "ppo_believer":
         sizes |= dict(num_envs=4, total_timesteps=40, num_minibatches=2, num_eval_episodes=2)
-    train(SCRIPTS[script], repr_dir=str(toy_stages / f"{TOY}__aib_repr__1"), **sizes)
-    assert rates[:6] == pytest.approx([1e-3, 1e-3, 1e-3, 1e-3, 2e-3 / 3, 1e-3 / 3])
+    train(module, repr_dir=str(toy_stages / f"{TOY}__aib_repr__1"), **sizes)
+    assert order == ["warm-up"] * 2 + ["teacher"] * 2 + ["memory"] * 2
+    assert rates[:6] == pytest.approx([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 5e-4]), "falls over the second half"
 
 
 @pytest.mark.parametrize(
     "variant",
     [
-        dict(action_head="mse", history_joints=False, gru_layers=2),
-        dict(action_head="none", bptt_steps=3, image_norm="none", chrono_init=False, image_shift=1),
+        dict(action_head="mse", warmup_updates=1, prior_nll=1.0),
+        dict(action_head="none", image_mask=0.0),
     ],
 )
 def test_ablations_train(toy_task: Path, toy_stages: Path, variant: dict) -> None:

@@ -20,13 +20,10 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import aib_repr
-import ppo_baseline
-from conftest import ONE_ITERATION, ROOT, TASK, run, spaces
+from conftest import ONE_ITERATION, ROOT, TASK, run
 
 sys.path.append(str(ROOT / "benchmark"))
 import diagnose_agent  # noqa: E402
-import reach  # noqa: E402
-import true_state  # noqa: E402
 
 
 def test_dataset(quick_runs: Path) -> None:
@@ -135,61 +132,6 @@ def test_an_agent_is_diagnosed_and_nothing_is_written(
     refused("is no agent", diagnose_agent.Args(agent.with_name("checkpoint.pt")))
     plain = Path("runs") / f"{TASK}__ppo_baseline_quick__1" / "agent.pt"
     refused("needs an agent with a belief", diagnose_agent.Args(plain, swap_particles=True))
-
-
-@pytest.mark.thorough
-def test_reach_plays_every_second_scene_anew_and_stage_2_takes_it(
-    quick_runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    monkeypatch.chdir(quick_runs.parent)
-
-    def refused(words: str, **changes: object) -> None:
-        with pytest.raises(SystemExit):
-            reach.main(reach.Args(**{**arguments, **changes}))
-        assert words in capsys.readouterr().err
-
-    agent = true_state.StateAgent(spaces([1, 1, 3], 28, 8), true_state.Args())
-    content = {"kind": "ppo_baseline agent", "env_id": TASK, "agent": agent.state_dict()}
-    ppo_baseline.save(quick_runs / "agents" / "target.pt", content)
-    arguments = dict(env_id=TASK, exp_name="aib_repr_quick_reach", agent="runs/agents/target.pt", num_workers=2)
-    arguments["repr_dir"] = f"runs/{TASK}__aib_repr_quick__1"
-    refused("sees other things than joints and a position", agent=f"runs/{TASK}__ppo_baseline_quick__1/agent.pt")
-    refused("has seed 1, this run needs 2", seed=2)
-    options = []
-    for name, value in arguments.items():
-        options += [f"--{name.replace('_', '-')}", str(value)]
-    code, out, err = run("benchmark/reach", *options, cwd=quick_runs.parent)
-    assert code == 0 and "4 episodes of reaching" in out, err
-    path = quick_runs / f"{TASK}__aib_repr_quick_reach__1"
-    options = ["--env-id", TASK, "--quick", "--repr-dir", f"runs/{path.name}", "--exp-name", "aib_belief_quick_reach"]
-    code, _, err = run("aib_belief", *options, cwd=quick_runs.parent)
-    assert code == 0, err
-    folders = [quick_runs / f"{TASK}__aib_repr_quick__1", path]
-    before, after = ({file.stem: np.load(file) for file in (x / "dataset").glob("*.npy")} for x in folders)
-    assert before.keys() == after.keys()
-    for name, x in before.items():
-        assert x.dtype == after[name].dtype and np.array_equal(x[::2], after[name][::2])
-    assert np.allclose(before["state"][1::2, 0], after["state"][1::2, 0], atol=1e-5), "the same scenes"
-    assert np.array_equal(before["cue"], after["cue"])
-    env = reach.ShowRandomObject(aib_repr.make_task(aib_repr.Args(env_id=TASK), 1), pictures=True)
-    goals = set()
-    for seed in range(12):
-        obs, _ = env.reset(seed=seed)
-        objects = [x.pose.p[0].numpy() for x in env.unwrapped.cubes.values()]
-        goals |= {i for i, x in enumerate(objects) if np.array_equal(x, obs["joints"][25:])}
-    assert len(goals) > 3, "not always the same object"
-    env.reset(seed=1_000_003 % 2**29 + 2**30)
-    for t, action in enumerate(after["actions"][3, :20]):
-        assert not np.array_equal(action, before["actions"][3, t])
-        obs, reward, _, _, info = env.step(action)
-        assert np.allclose(after["joints"][3, t + 1], obs["joints"][:25], atol=1e-5), (
-            "what the action led to comes after it"
-        )
-        assert np.allclose(after["state"][3, t + 1], info["state"], atol=1e-5)
-        assert np.isclose(after["rewards"][3, t], reward, atol=1e-5)
-    env.close()
-    refused("has no objects to reach for", env_id="InterceptFast-v0")
-    refused("exists; choose another --exp-name")
 
 
 def test_an_episode_follows_from_its_seed_and_actions_in_whatever_process(quick_runs: Path) -> None:

@@ -20,7 +20,7 @@ import toy
 from conftest import TOY, spaces
 
 IMAGE, J, A, U, T, B = [36, 36, 3], 3, 2, 4, 10, 3
-CONFIG = {"image_shape": IMAGE, "joints_dim": J, "state_dim": 7, "gru_layers": 1, "u_dim": U, "z_dim": 5}
+CONFIG = {"image_shape": IMAGE, "joints_dim": J, "state_dim": 7, "u_dim": U, "z_dim": 5}
 
 
 @pytest.fixture(autouse=True)
@@ -56,20 +56,26 @@ def test_stage_1() -> None:
 
 @pytest.mark.parametrize("head", ["flow", "mse", "none", "believer"])
 def test_stage_2(head: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the CNN in chunks, too."""
+    """With the images in chunks, and the warm-up, too."""
     module = ppo_believer if head == "believer" else aib_belief
-    monkeypatch.setattr(module, "CNN_CHUNK", 20)
+    monkeypatch.setattr(module, "IMAGE_CHUNK", 20)
     belief = ppo_believer.BelieverBelief(CONFIG) if head == "believer" else aib_belief.AIBBelief(CONFIG)
     model = nn.ModuleDict({"belief": belief, "posterior": module.GaussianMLP(U + 256, [8], 5, min_std=0.1)})
     if head in ("flow", "mse"):
         model["head"] = module.mlp([10 + (A + 1) * (head == "flow"), 8, A])
+    model["teacher"], model["locator"] = module.Teacher(U), module.Locator(U)
     model.to("meta")
+    args = module.Args(z_dim=5, warmup_updates=1, prior_nll=1.0)
+    if head != "believer":
+        args.action_head = head
+    frames = {"rgb": images(B), "u": random(B, U), "u_0": random(B, U)}
+    module.warmup_losses(model, frames, args)["total"].backward()
     batch = {"rgb": images(T + 1, B), "joints": random(T + 1, B, J), "u": random(T + 1, B, U)}
     batch |= {"actions": random(T, B, A), "cue": random(B, 1)}
     if head == "believer":
-        losses = module.believer_losses(model, batch, module.Args(bptt_steps=4))
+        losses = module.believer_losses(model, batch, args)
     else:
-        losses = module.belief_losses(model, batch, module.Args(action_head=head, bptt_steps=4))
+        losses = module.belief_losses(model, batch, args)
     losses["total"].backward()
     if head == "believer":
         held_out = module.validate_belief(belief, lambda index: batch, np.arange(B))

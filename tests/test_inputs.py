@@ -103,7 +103,7 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_believer", ["--eval-every", "0"], ["--eval-every 0"]),
         ("ppo_baseline", ["--seed", "-1"], ["--seed -1"]),
         ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
-        ("ppo_baseline", ["--final-std", "0"], ["--final-std 0.0", "at least 0.001"]),
+        ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
         ("ppo_baseline", ["--noise-beta", "-0.1"], ["--noise-beta -0.1", "between 0 and 2"]),
         ("ppo_baseline", ["--num-eval-episodes", "1"], ["--num-eval-episodes 1 must be at least 2"]),
         ("ppo_aib", ["--noise-beta", "2.5"], ["--noise-beta 2.5", "between 0 and 2"]),
@@ -112,7 +112,7 @@ def test_a_folder_that_cannot_be_written() -> None:
         ("ppo_aib", ["--small", "--quick"], ["--small and --quick exclude each other"]),
         ("ppo_baseline", ["--exp-name", "a/b"], ["--exp-name a/b", "without /"]),
         ("ppo_aib", ["--image-size", "32"], ["--image-size 32", "at least 36"]),
-        ("aib_belief", ["--image-shift", "-1"], ["--image-shift -1", "at least 0"]),
+        ("aib_belief", ["--image-mask", "1.5"], ["--image-mask 1.5", "between 0 and 1"]),
         ("aib_repr", ["--val-fraction", "1.5"], ["--val-fraction 1.5", "between 0 and 1"]),
         ("ppo_believer", ["--num-minibatches", "0"], ["--num-minibatches 0", "at least 1"]),
         (
@@ -322,7 +322,7 @@ def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.Cap
     change(Path(f"runs/{TOY}__ppo_aib__1/checkpoint.pt"), iteration=0)()
     weights = torch.load(BELIEF_PT, weights_only=True)["belief"]
     retrained = {name: 1.01 * x for name, x in weights.items()}
-    for other in (retrained, weights | {"history.gru.weight_ih_l1": torch.zeros(768, 256)}):  # two GRU layers
+    for other in (retrained, weights | {"history.gru.bias": torch.zeros(768)}):  # another GRU
         change(BELIEF_PT, belief=other)()
         with pytest.raises(SystemExit) as stop:
             train(ppo_aib, **PPO, num_episodes=20)

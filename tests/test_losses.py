@@ -18,7 +18,7 @@ import ppo_believer
 from conftest import TOY, spaces, train
 
 IMAGE = [36, 36, 3]
-CONFIG = {"image_shape": IMAGE, "joints_dim": 0, "state_dim": 5, "gru_layers": 1, "u_dim": 4, "z_dim": 5}
+CONFIG = {"image_shape": IMAGE, "joints_dim": 7, "state_dim": 5, "u_dim": 4, "z_dim": 5}
 T, B, A = 6, 3, 2
 SELECT, REPORT = slice(0, 20), slice(20, 40)
 
@@ -28,6 +28,9 @@ def belief_model(head: str = "flow", config: dict = CONFIG) -> nn.ModuleDict:
     model = nn.ModuleDict({"belief": aib_belief.AIBBelief(config)})
     model["posterior"] = aib_belief.GaussianMLP(config["u_dim"] + 256, [32], config["z_dim"], min_std=0.1)
     model["head"] = aib_belief.mlp([2 * config["z_dim"] + (A + 1) * (head == "flow"), 32, A])
+    model["teacher"], model["locator"] = aib_belief.Teacher(config["u_dim"]), aib_belief.Locator(config["u_dim"])
+    model["teacher"].eval()
+    nn.init.orthogonal_(model["belief"].history.arm.weight)  # starts at 0
     return model
 
 
@@ -43,7 +46,8 @@ def belief_batch(steps: int = T) -> dict[str, torch.Tensor]:
 
 
 def losses_args(**changes: object) -> SimpleNamespace:
-    defaults = dict(bptt_steps=None, beta=1.0, action_head="flow", fm_latent="mean", action_lambda=1.0)
+    defaults = dict(beta=1.0, action_head="flow", fm_latent="mean", action_lambda=1.0, z_dim=CONFIG["z_dim"])
+    defaults |= dict(image_mask=0.0, warmup_updates=0, prior_nll=0.0)
     return SimpleNamespace(**{**defaults, **changes})
 
 
@@ -156,7 +160,8 @@ def test_total_loss_adds_up_and_ablations_leave_their_term_out() -> None:
     for head, terms in (("flow", {"nll", "kl", "action"}), ("mse", {"nll", "kl", "action"}), ("none", {"nll", "kl"})):
         args = losses_args(action_head=head, beta=0.5, action_lambda=0.1)
         losses = aib_belief.belief_losses(belief_model(head), batch, args)
-        assert losses.keys() == terms | {"total"}
+        assert losses.keys() == terms | {"prior_nll", "memory", "total"}
+        assert losses["prior_nll"] == losses["memory"] == 0, "the paper has neither"
         total = losses["nll"] + 0.5 * losses["kl"] + 0.1 * losses.get("action", 0)
         assert torch.allclose(losses["total"], total)
 
@@ -167,7 +172,7 @@ def test_what_the_action_head_sees_of_the_posterior(head: str, latent: str) -> N
     torch.manual_seed(2)
     loss = aib_belief.belief_losses(model, batch, losses_args(action_head=head, fm_latent=latent))["action"]
     torch.manual_seed(2)
-    h = aib_belief.encode_history(model["belief"].history, batch)
+    h = aib_belief.encode_history(model["belief"].history, batch)[0]
     q = model["posterior"](torch.cat([batch["u"], h], -1))
     sample, action = q.rsample(), batch["actions"]
     z = {"mean": q.mean, "sample": sample}[latent]
@@ -194,19 +199,19 @@ def test_flow_loss_shapes_the_posterior_and_the_prior_only_through_the_kl() -> N
     assert moved(losses["kl"], model["belief"].prior)
     samples = aib_belief.belief_losses(model, batch, losses_args(fm_latent="sample"))
     assert moved(samples["action"], model["posterior"])
-    believer = nn.ModuleDict({"belief": ppo_believer.BelieverBelief(CONFIG), "posterior": model["posterior"]})
+    believer = nn.ModuleDict({**model, "belief": ppo_believer.BelieverBelief(CONFIG)})
     assert moved(ppo_believer.believer_losses(believer, batch, losses_args())["nll"], model["posterior"])
 
 
 def test_believer_has_a_fixed_prior() -> None:
     torch.manual_seed(0)
     belief, h = ppo_believer.BelieverBelief(CONFIG), torch.randn(T, B, 256)
-    model = nn.ModuleDict({"belief": belief, "posterior": belief_model()["posterior"]})
+    model = nn.ModuleDict({**belief_model(), "belief": belief})
     batch, args = belief_batch(), losses_args(beta=0.5)
     torch.manual_seed(1)
     losses = ppo_believer.believer_losses(model, batch, args)
     torch.manual_seed(1)
-    history = ppo_believer.encode_history(belief.history, batch)
+    history = ppo_believer.encode_history(belief.history, batch)[0]
     q = model["posterior"](torch.cat([batch["u"], history], -1))
     nll = -belief.decoder(torch.cat([q.rsample(), history], -1)).log_prob(batch["u"]).sum(-1).mean()
     kl = (0.5 * (q.mean**2 + q.stddev**2 - 1) - q.stddev.log()).sum(-1).mean()
@@ -223,7 +228,7 @@ def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
     seen = aib_belief.encode(belief, posterior, lambda index: batch, np.arange(B))
     torch.manual_seed(0)
     with torch.no_grad():
-        h = aib_belief.encode_history(belief.history, batch)
+        h = aib_belief.encode_history(belief.history, batch)[0]
         aib_belief.elbo_terms(belief, posterior, batch["u"], h)  # draws its noise first
         p, noise = belief.prior(h), torch.randn(T + 1, B, 30, 5)
         density, means = torch.zeros(T + 1, B), torch.zeros(T + 1, B, 4)
@@ -236,76 +241,137 @@ def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
 
 
 def test_sequence_and_step_path_agree() -> None:
-    history = belief_model(config={**CONFIG, "gru_layers": 2, "joints_dim": 7})["belief"].history
-    batch, memory = belief_batch(), None
-    whole = aib_belief.encode_history(history, batch)
+    history, batch, hidden = belief_model()["belief"].history, belief_batch(), None
+    whole, memory = aib_belief.encode_history(history, batch)
+    assert whole.shape == (T + 1, B, 256) and memory.shape == (T + 1, B, 16)
     for t in range(T + 1):
-        h, memory = history(history.embed(batch["rgb"][t], batch["joints"][t])[None], memory)
-        assert torch.allclose(h[0], whole[t], atol=1e-5)
+        if t:
+            assert torch.allclose(history.code(hidden), memory[t], atol=1e-5), "of the state before the picture"
+        h, hidden = history(batch["rgb"][t], batch["joints"][t], hidden)
+        assert torch.allclose(h, whole[t], atol=1e-5)
 
 
-def gradient_of_first_frame(bptt_steps: int | None, steps: int = 59) -> torch.Tensor:
-    """Gradient of h at the last step with respect to the embedding of frame 0."""
-    history, batch = belief_model()["belief"].history, belief_batch(steps)
-    kept = []
-    handle = history.cnn.register_forward_hook(lambda module, x, y: (y.retain_grad(), kept.append(y))[1])
-    h = aib_belief.encode_history(history, batch, bptt_steps)
-    handle.remove()
-    h[-1].sum().backward()
-    return kept[0].grad.view(steps + 1, B, -1)[0]
-
-
-def test_truncated_back_propagation_cuts_exactly() -> None:
-    assert gradient_of_first_frame(None).abs().sum() > 0
-    assert gradient_of_first_frame(16).abs().sum() == 0
-    assert torch.equal(gradient_of_first_frame(60), gradient_of_first_frame(None))
-
-
-def test_chunks_of_frames_give_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_reach_the_first_frame_and_come_in_chunks_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     gradients = []
     for frames in (2048, 5):
-        monkeypatch.setattr(aib_belief, "CNN_CHUNK", frames)
-        model, batch = belief_model(config={**CONFIG, "joints_dim": 7}), belief_batch()
-        aib_belief.belief_losses(model, batch, losses_args())["total"].backward()
-        gradients.append([x.grad for name, x in model.named_parameters() if not name.startswith("belief.phi")])
+        monkeypatch.setattr(aib_belief, "IMAGE_CHUNK", frames)
+        model, batch = belief_model(), belief_batch()
+        aib_belief.belief_losses(model, batch, losses_args(prior_nll=1.0))["total"].backward()
+        gradients.append([x.grad for name, x in model.named_parameters() if x.grad is not None])
+    assert len(gradients[0]) > 20
     assert all(torch.allclose(one, other, rtol=1e-4, atol=1e-6) for one, other in zip(*gradients, strict=True))
+    history, batch = belief_model()["belief"].history, belief_batch(59)
+    images = batch["rgb"].float().requires_grad_()
+    look = history.look
+    monkeypatch.setattr(history, "look", lambda rgb, mask: look(rgb + 0, mask))  # look subtracts in place
+    aib_belief.encode_history(history, {**batch, "rgb": images})[0][-1].sum().backward()
+    assert images.grad[0].abs().sum() > 0
 
 
-def test_images_of_an_episode_are_shifted_alike_and_each_episodes_differently() -> None:
-    rgb = torch.randint(0, 256, (T, 40, *IMAGE), dtype=torch.uint8)
-    shifted, untouched = rgb.clone(), rgb.clone()
-    aib_belief.shift_images(shifted, 2, np.random.default_rng(0))
-    aib_belief.shift_images(untouched, 0, np.random.default_rng(0))
-    assert torch.equal(untouched, rgb)
-    pairs = [(y, x) for y in range(-2, 3) for x in range(-2, 3)]
-    fits = [
-        [torch.equal(new, old.roll(pair, (1, 2))) for pair in pairs]
-        for old, new in zip(rgb.unbind(1), shifted.unbind(1), strict=True)
-    ]
-    assert all(sum(row) == 1 for row in fits) and sum(map(any, zip(*fits, strict=True))) > 15
+def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
+    history, rgb = belief_model()["belief"].history, torch.zeros(2, *IMAGE, dtype=torch.uint8)
+    rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255  # a patch is 2 x 2 pixels here
+    keys, contents, _ = history.look(rgb)
+    assert keys.shape == (2, 18**2, 16) and contents.shape == (2, 18**2, 10)
+    patches = [2 * 18 + 5, 15 * 18 + 10]
+    assert torch.allclose(keys[0, patches[0]], keys[1, patches[1]]), "a key holds no coordinates"
+    assert torch.allclose(keys[0, 0], keys[1, 99]) and not torch.allclose(keys[0, 0], keys[0, patches[0]])
+    history.query = nn.Identity()
+    place, log_weights = history.attend(keys[0, patches[0]].expand(2, -1) * 50, keys * 50, contents)
+    assert log_weights.argmax(-1).tolist() == patches and torch.allclose(log_weights.exp().sum(-1), torch.ones(2))
+    row_and_column = [[2 / 17 * 2 - 1, 5 / 17 * 2 - 1], [15 / 17 * 2 - 1, 10 / 17 * 2 - 1]]
+    assert torch.allclose(place[:, :2], torch.tensor(row_and_column), atol=1e-3)
+
+
+def test_masks_hide_blocks_of_two_by_two_pixels() -> None:
+    history = aib_belief.HistoryEncoder({**CONFIG, "image_shape": [37, 45, 3]})
+    rgb = torch.randint(0, 256, (40, 37, 45, 3), dtype=torch.uint8)
+    history.image_mean = torch.full((37, 45, 3), 3.5)
+    seen = []
+    history.token.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].unflatten(2, (3, 4))))
+    plain, again, masked = history.look(rgb), history.look(rgb), history.look(rgb, 0.75)
+    assert torch.equal(plain[0], again[0]) and not torch.equal(plain[0], masked[0])
+    hidden = (seen[2] == 0).flatten(2).all(-1)
+    assert 0.72 < hidden.float().mean() < 0.78 and torch.equal(seen[2][~hidden], seen[0][~hidden])
+    assert hidden.float().mean(0).min() > 0.4, "not the same blocks in all pictures"
+
+
+def test_warmup_losses_are_the_closed_forms() -> None:
+    model = belief_model()
+    model["teacher"].train()
+    batch = {"rgb": belief_batch()["rgb"][0], "u": torch.randn(B, 4), "u_0": torch.randn(B, 4)}
+    torch.manual_seed(3)
+    losses = aib_belief.warmup_losses(model, batch, losses_args())
+    history, belief = model["belief"].history, model["belief"]
+    u_0 = batch["u_0"]
+    standard = (u_0 - u_0.mean(0)) / (u_0.var(0, correction=0) + 0.05**2).sqrt()
+    memory = model["teacher"].net(standard)
+    keys, contents, _ = history.look(batch["rgb"])
+    weights = (keys * torch.nn.functional.layer_norm(history.query(memory), [16])[:, None]).sum(-1).softmax(-1)
+    place = (weights[..., None] * contents).sum(1)
+    h = history.out(torch.cat([memory, history.place(place)], -1)) + history.arm.bias
+    p = belief.prior(h)
+    torch.manual_seed(3)
+    decoded = belief.decoder(torch.cat([p.mean + p.stddev * torch.randn(B, 1, 5)[:, 0], h], -1))
+    assert torch.allclose(losses["error"], (decoded.mean - batch["u"]).square().sum(-1).mean(), atol=1e-4)
+    located = model["locator"](contents)
+    density = Normal(located.mean, located.stddev).log_prob(batch["u"][:, None]).sum(-1).exp()
+    assert torch.allclose(losses["place"], -(weights * density).sum(-1).log().mean(), atol=1e-4)
+    at_place = model["locator"](place).mean
+    assert torch.allclose(losses["locator"], (at_place - batch["u"]).square().sum(-1).mean(), atol=1e-4)
+    assert torch.allclose(losses["total"], losses["error"] + losses["place"] + losses["locator"])
+
+    def gradient(loss: str, parameter: torch.Tensor) -> float:
+        grad = torch.autograd.grad(losses[loss], parameter, retain_graph=True, allow_unused=True)[0]
+        return 0.0 if grad is None else grad.abs().sum().item()
+
+    locator = model["locator"].mean[0].weight
+    assert gradient("locator", locator) > 0 and gradient("place", locator) == 0, "fitted at the attended place alone"
+    assert gradient("locator", history.query[0].weight) == 0 and gradient("place", history.query[0].weight) > 0
+    assert gradient("place", model["locator"].raw_std) > 0
+
+
+def test_beside_the_elbo_the_prior_and_the_memory_are_trained() -> None:
+    model, batch = belief_model(), belief_batch()
+    args = losses_args(warmup_updates=5, prior_nll=0.5)
+    for teacher_acts in (False, True):
+        torch.manual_seed(4)
+        losses = aib_belief.belief_losses(model, batch, args, teacher_acts)
+        total = losses["nll"] + losses["kl"] + losses["action"] + 0.5 * losses["prior_nll"] + losses["memory"]
+        assert torch.allclose(losses["total"], total)
+        wanted = model["teacher"](batch["u"][0])
+        used = wanted if teacher_acts else None
+        h, memory = aib_belief.encode_history(model["belief"].history, batch, 0.0, used)
+        assert torch.allclose(losses["memory"], (memory - wanted).square().sum(-1).mean(), atol=1e-5)
+        grads = torch.autograd.grad(losses["memory"], list(model["teacher"].parameters()), allow_unused=True)
+        assert all(grad is None for grad in grads), "the teacher does not follow"
+        torch.manual_seed(4)
+        p, noise = model["belief"].prior(h), torch.randn(T + 1, B, 1, 5)[:, :, 0]
+        decoded = model["belief"].decoder(torch.cat([p.mean + p.stddev * noise, h], -1))
+        assert torch.allclose(losses["prior_nll"], -decoded.log_prob(batch["u"]).sum(-1).mean(), atol=1e-4)
+    assert not torch.allclose(h, aib_belief.encode_history(model["belief"].history, batch)[0], atol=1e-3)
 
 
 def test_joints_enter_the_history_standardised() -> None:
-    history, batch = belief_model(config={**CONFIG, "joints_dim": 7})["belief"].history, belief_batch()
-    plain = aib_belief.encode_history(history, batch)
+    history, batch = belief_model()["belief"].history, belief_batch()
+    plain, _ = aib_belief.encode_history(history, batch)
     history.joints_mean.fill_(3.0)
     history.joints_std.fill_(2.0)
+    assert not torch.allclose(aib_belief.encode_history(history, batch)[0], plain, atol=1e-3)
     batch["joints"] = batch["joints"] * 2 + 3
-    assert torch.allclose(aib_belief.encode_history(history, batch), plain, atol=1e-5)
+    assert torch.allclose(aib_belief.encode_history(history, batch)[0], plain, atol=1e-5)
 
 
 def test_chrono_initialisation_sets_the_update_gate() -> None:
-    gru = nn.GRU(8, 64, 2)
+    gru = nn.GRUCell(8, 64)
     aib_belief.chrono_init(gru, 60)
-    for layer in range(2):
-        bias = getattr(gru, f"bias_ih_l{layer}")[64:128] + getattr(gru, f"bias_hh_l{layer}")[64:128]
-        assert bias.min() >= 0 and bias.max() <= math.log(59) and bias.std() > 0.3
+    bias = gru.bias_ih[64:128] + gru.bias_hh[64:128]
+    assert bias.min() >= 0 and bias.max() <= math.log(59) and bias.std() > 0.3
     # with all weights 0 the update gate alone decides what is kept: sigmoid(bias), so about 1 / (1 - gate) steps
     for name, parameter in gru.named_parameters():
         if "weight" in name:
             nn.init.zeros_(parameter)
-    kept = gru(torch.zeros(1, 1, 8), torch.ones(2, 1, 64))[1]
-    assert kept.mean() > 0.85
+    assert gru(torch.zeros(1, 8), torch.ones(1, 64)).mean() > 0.85
 
 
 def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_stages: Path) -> None:
@@ -316,7 +382,7 @@ def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_
     joints = torch.from_numpy(np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "joints.npy")[:15]).flatten(0, 1)
     assert torch.allclose(history["history.joints_mean"], joints.mean(0), atol=1e-4)
     assert torch.allclose(history["history.joints_std"], joints.std(0, correction=0), atol=1e-4)
-    gate = history["history.gru.bias_ih_l0"][256:512]
+    gate = history["history.gru.bias_ih"][256:512]
     assert gate.min() > -0.1 and 1 < gate.max() < math.log(9) + 0.1, "chrono_init, and three updates"
     model = torch.load(toy_stages / f"{TOY}__aib_repr__1" / "checkpoint.pt", weights_only=True)["model"]
     dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
@@ -344,15 +410,15 @@ def test_psi_without_images_sees_the_joints_alone(toy_stages: Path) -> None:
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:
     psi, history = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4), aib_belief.HistoryEncoder(CONFIG)
     rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.randn(2, 7)
-    for encoder, encode in (
-        (psi, lambda x: psi(x, joints).mean),
-        (history, lambda x: history.embed(x, joints)),
+    for encoder, encode, layer in (
+        (psi, lambda x: psi(x, joints).mean, psi.cnn.out[0]),
+        (history, lambda x: history(x, joints)[0], history.token[0][0]),
     ):
         plain = encode(rgb)
         encoder.image_mean, encoder.image_std = torch.full(IMAGE, 50.0), torch.tensor(510.0)
         assert not torch.allclose(encode(rgb), plain, atol=1e-4)
         assert torch.allclose(encode(2 * rgb + 50), plain, atol=1e-5)
-        weight = encoder.cnn.out[0].weight
+        weight = layer.weight
         gram = weight.T @ weight if len(weight) > weight.shape[1] else weight @ weight.T
         assert torch.allclose(gram, 2 * torch.eye(len(gram)), atol=1e-4)
 
