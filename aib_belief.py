@@ -113,7 +113,7 @@ TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=1500, batch_episodes=16, belief_lr=2e-3)
 SMALL |= dict(warmup_updates=4000, prior_nll=1.0, val_every=250)
 SMALL |= dict(image_size=64, repr_dir="runs/{env_id}__aib_repr_small__{seed}")
-QUICK = dict(exp_name="aib_belief_quick", num_episodes=8, num_updates=4, batch_episodes=4)
+QUICK = dict(exp_name="aib_belief_quick", num_episodes=8, warmup_updates=2, num_updates=4, batch_episodes=4)
 QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
 
 

@@ -187,6 +187,7 @@ SMALL |= dict(warmup_updates=4000, prior_nll=1.0, val_every=250)
 SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
 QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
 QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_episodes=8, num_updates=4, batch_episodes=4)
+QUICK["warmup_updates"] = 2
 
 
 # ---------------------------------------------------------------- networks

@@ -34,6 +34,7 @@ def main(args: ppo_believer.Args) -> None:
     belief.prior = lambda h: Normal(h.new_zeros(*h.shape[:-1], args.z_dim), 1.0)
     posterior = ppo_believer.GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     model = torch.nn.ModuleDict({"belief": belief, "posterior": posterior})
+    model["teacher"], model["locator"] = ppo_believer.Teacher(stored["u_dim"]), ppo_believer.Locator(stored["u_dim"])
     model.load_state_dict(ppo_believer.load(path / "belief_checkpoint.pt", "")["model"])
     model.to(args.device)
     held_out = np.arange(args.num_episodes)[-stored["num_val"] :]
