@@ -325,15 +325,15 @@ class HistoryEncoder(nn.Module):
 
 
 class Teacher(nn.Module):
-    """The memory that an episode calls for, told by its first privileged state: u_0 (B, u_dim) -> memory (B, 16)."""
+    """What to remember at step t, told by the first privileged state: u_0 (B, u_dim), t (B,) -> memory (B, 16)."""
 
     def __init__(self, u_dim: int):
         super().__init__()
         self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)
-        self.net = orthogonal_init(mlp([u_dim, 64, 16]))
+        self.net = orthogonal_init(mlp([u_dim + 1, 64, 16]))
 
-    def forward(self, u_0: Tensor) -> Tensor:
-        return self.net(self.standardise(u_0))
+    def forward(self, u_0: Tensor, t: Tensor) -> Tensor:
+        return self.net(torch.cat([self.standardise(u_0), t.log1p().unsqueeze(-1)], -1))
 
 
 class Locator(nn.Module):
@@ -412,32 +412,32 @@ def encode_history(
 ) -> tuple[Tensor, Tensor]:
     """h (T+1, B, 256) and memory (T+1, B, 16) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J).
 
-    teacher_memory (B, 16), if given, asks and answers in place of the memory, which is returned all the same.
+    teacher_memory (T+1, B, 16), if given, asks and answers in place of the memory, which is returned all the same.
     """
     seen = [history.look(rgb, mask) for rgb in batch["rgb"].flatten(0, 1).split(IMAGE_CHUNK)]
     keys, contents, summary = (torch.cat(x).unflatten(0, batch["rgb"].shape[:2]) for x in zip(*seen, strict=True))
     hidden, memories, places = batch["joints"].new_zeros(keys.shape[1], 256), [], []
-    for step in zip(keys, contents, summary, strict=True):
+    for t, step in enumerate(zip(keys, contents, summary, strict=True)):
         memories.append(history.code(hidden))
-        used = memories[-1] if teacher_memory is None else teacher_memory
+        used = memories[-1] if teacher_memory is None else teacher_memory[t]
         place, _ = history.attend(used, *step[:2])
         places.append(place)
         hidden = history.gru(torch.cat([step[2], place], -1), hidden)
     memory, place = torch.stack(memories), torch.stack(places)
-    used = memory if teacher_memory is None else teacher_memory.expand_as(memory)
+    used = memory if teacher_memory is None else teacher_memory
     return history.combine(used, place, batch["joints"]), memory
 
 
 def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
 
-    The teacher's memory of u_0, the privileged state at the episode's start, asks in place of the GRU's (as the first
+    The teacher's memory, of the privileged state at the episode's start, asks in place of the GRU's (as the first
     phase of Kumar et al., 2021). error: of u from z ~ p(z). place: -log sum_i w_i N(u; locator(patch i)) over the
     attention's weights w_i, which tells the attention where u says that the object is; locator: its error of u.
     """
     belief, u = model["belief"], batch["u"]
     keys, contents, _ = belief.history.look(batch["rgb"], args.image_mask)
-    memory = model["teacher"](batch["u_0"])
+    memory = model["teacher"](batch["u_0"], batch["t"])
     place, log_weights = belief.history.attend(memory, keys, contents)
     h = belief.history.combine(memory, place, belief.history.joints_mean)  # without joints, which identify an episode
     decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device))
@@ -459,7 +459,10 @@ def history_losses(
     prior_nll: -log p(u|z,h) with z from the prior. memory: squared error of the memory from the teacher's.
     teacher_acts: h is of the teacher's memory, the GRU's only follows it.
     """
-    teacher_memory = model["teacher"](batch["u"][0]).detach()
+    t = torch.arange(len(batch["u"]), device=batch["u"].device)
+    u_0 = batch["u"][0].expand_as(batch["u"])
+    teacher_memory = model["teacher"](u_0.flatten(0, 1), t.repeat_interleave(u_0.shape[1])).detach()
+    teacher_memory = teacher_memory.unflatten(0, u_0.shape[:2])
     h, memory = encode_history(
         model["belief"].history, batch, args.image_mask, teacher_memory if teacher_acts else None
     )
@@ -537,9 +540,9 @@ class EpisodeDataset:
         return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
 
     def frames(self, episode: np.ndarray, t: np.ndarray) -> dict[str, Tensor]:
-        """Single frames t (B,) of episodes (B,): rgb (B, H, W, 3), u, and u_0 of the episode's start (B, u_dim)."""
+        """Single frames of episodes (B,) at steps t (B,): rgb (B, H, W, 3), u, t, and the episode's first u, u_0."""
         batch = {name: self.arrays[name][episode, t].to(self.device) for name in ("rgb", "u")}
-        return batch | {"u_0": self.arrays["u"][episode, 0].to(self.device)}
+        return batch | {"u_0": self.arrays["u"][episode, 0].to(self.device), "t": torch.from_numpy(t).to(self.device)}
 
 
 def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:

@@ -68,7 +68,7 @@ def test_stage_2(head: str, monkeypatch: pytest.MonkeyPatch) -> None:
     args = module.Args(z_dim=5, warmup_updates=1, prior_nll=1.0)
     if head != "believer":
         args.action_head = head
-    frames = {"rgb": images(B), "u": random(B, U), "u_0": random(B, U)}
+    frames = {"rgb": images(B), "u": random(B, U), "u_0": random(B, U), "t": random(B)}
     module.warmup_losses(model, frames, args)["total"].backward()
     batch = {"rgb": images(T + 1, B), "joints": random(T + 1, B, J), "u": random(T + 1, B, U)}
     batch |= {"actions": random(T, B, A), "cue": random(B, 1)}

@@ -300,12 +300,13 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     model = belief_model()
     model["teacher"].train()
     batch = {"rgb": belief_batch()["rgb"][0], "u": torch.randn(B, 4), "u_0": torch.randn(B, 4)}
+    batch["t"] = torch.arange(B) + 1
     torch.manual_seed(3)
     losses = aib_belief.warmup_losses(model, batch, losses_args())
     history, belief = model["belief"].history, model["belief"]
     u_0 = batch["u_0"]
     standard = (u_0 - u_0.mean(0)) / (u_0.var(0, correction=0) + 0.05**2).sqrt()
-    memory = model["teacher"].net(standard)
+    memory = model["teacher"].net(torch.cat([standard, (batch["t"] + 1).log()[:, None]], -1))
     keys, contents, _ = history.look(batch["rgb"])
     weights = (keys * torch.nn.functional.layer_norm(history.query(memory), [16])[:, None]).sum(-1).softmax(-1)
     place = (weights[..., None] * contents).sum(1)
@@ -339,7 +340,7 @@ def test_beside_the_elbo_the_prior_and_the_memory_are_trained() -> None:
         losses = aib_belief.belief_losses(model, batch, args, teacher_acts)
         total = losses["nll"] + losses["kl"] + losses["action"] + 0.5 * losses["prior_nll"] + losses["memory"]
         assert torch.allclose(losses["total"], total)
-        wanted = model["teacher"](batch["u"][0])
+        wanted = torch.stack([model["teacher"](batch["u"][0], torch.full((B,), t)) for t in range(T + 1)])
         used = wanted if teacher_acts else None
         h, memory = aib_belief.encode_history(model["belief"].history, batch, 0.0, used)
         assert torch.allclose(losses["memory"], (memory - wanted).square().sum(-1).mean(), atol=1e-5)
