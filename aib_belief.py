@@ -2,7 +2,8 @@
 
 A recurrent encoder h of the history, a prior p(z|h), a posterior q(z|u,h) and a decoder p(u|z,h) model what the history
 tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) shapes the posterior; the KL term hands
-that shape to the prior, which is what the robot has when it acts.
+that shape to the prior, which is what the robot has when it acts. With --warmup-updates the history encoder first
+learns, on single frames, to find what a memory asks for.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
 Reads:   --repr-dir, by default runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where the default has no
@@ -68,7 +69,7 @@ class Args:
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
     small: bool = False
-    """a reduced setting for a CPU, half an hour for all stages; tuned on RememberColor3-v0, seed 1"""
+    """a reduced setting for a CPU, some 40 minutes for all stages of RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False

@@ -88,7 +88,7 @@ class Args:
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
     small: bool = False
-    """a reduced setting for a CPU, half an hour for all stages; tuned on RememberColor3-v0, seed 1"""
+    """a reduced setting for a CPU, some 40 minutes for all stages of RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
     overwrite: bool = False
@@ -541,7 +541,7 @@ def main(args: Args) -> None:
     if args.num_minibatches > batch_size:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {batch_size} steps of an iteration")
     if args.total_timesteps > 1_000_000 and not CUDA:
-        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes half an hour", flush=True)
+        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes some 40 minutes", flush=True)
     path = check_run(args)
     resume = (path / "checkpoint.pt").exists() and not args.overwrite
     checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
