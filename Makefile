@@ -19,10 +19,10 @@ run: setup
 
 demo: setup
 	task="--env-id RememberColor3-v0 --small"
-	echo "AIB on RememberColor3-v0 in three stages, about 35 minutes on two cores; stopped, make demo resumes it"
+	echo "AIB on RememberColor3-v0 in three stages, an estimated 35 minutes on two cores; stopped, make demo resumes it"
 	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 3 minutes"
 	$(PY) aib_repr.py $$task
-	echo "stage 2 of 3: the belief, about 15 minutes"
+	echo "stage 2 of 3: the belief, an estimated 15 minutes"
 	$(PY) aib_belief.py $$task
 	echo "stage 3 of 3: PPO on observation and belief, about 14 minutes; curves: .venv/bin/tensorboard --logdir runs"
 	$(PY) ppo_aib.py $$task
