@@ -12,17 +12,12 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, Tensor
          checkpoint.pt to resume
 """
 
-import ctypes
 import fcntl
 import json
 import math
 import os
-import shlex
 import shutil
-import signal
-import subprocess
 import sys
-import zlib
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -39,8 +34,8 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 8  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
+VAL_EVERY = 250  # updates of the belief between checkpoints, each with a validation
 IMAGE_CHUNK = 4096 if CUDA else 64  # images through the history encoder at a time: what a CPU's cache holds
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
@@ -58,27 +53,13 @@ class Args:
     """seed of weights, noise and episodes"""
     device: Literal["cpu", "cuda"] = "cuda" if CUDA else "cpu"
     """where the networks live"""
-    sim_backend: Literal["physx_cpu", "physx_cuda"] = "physx_cuda" if CUDA else "physx_cpu"
-    """physx_cpu: one process per scene; physx_cuda: all scenes as one batch on the GPU"""
-    render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
-    """renderer"""
-    robot_triangles: int = 0 if CUDA else 500
-    """triangles of each robot mesh, about; with 500 a CPU steps 5 to 10 times as fast; 0: meshes as they are"""
-    image_size: int = 128
-    """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
-    num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
     small: bool = False
     """a reduced setting for a CPU, by estimate 40 minutes for all stages of RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
-    overwrite: bool = False
-    """delete what the run directory holds and start again; to resume, leave it out"""
 
-    repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
-    """run directory of stage 1"""
-    num_episodes: int = 2000
-    """random episodes of stage 1, made if they are missing; must be the number that its dataset has"""
+    repr_dir: str | None = None
+    """run directory of stage 1; by default that of the same task, preset and seed"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 3) are taken to be updates"""
     batch_episodes: int = 256
@@ -101,21 +82,13 @@ class Args:
     """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
     prior_nll: float = 0.0
     """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
-    val_every: int = 50
-    """updates between checkpoints, each with a validation"""
 
 
-# (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
-LIMITS |= dict(image_mask=(0, 1), warmup_updates=(0, math.inf))
-# when a run is resumed; this stage does not simulate, it hands backends and workers on to aib_repr.py
-MAY_DIFFER = ("overwrite", "num_workers", "sim_backend", "render_backend")
+MAY_DIFFER = ()  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
-SMALL = dict(exp_name="aib_belief_small", num_episodes=640, num_updates=1500, batch_episodes=16, belief_lr=2e-3)
-SMALL |= dict(warmup_updates=4000, prior_nll=1.0, val_every=250)
-SMALL |= dict(image_size=64, repr_dir="runs/{env_id}__aib_repr_small__{seed}")
-QUICK = dict(exp_name="aib_belief_quick", num_episodes=8, warmup_updates=2, num_updates=4, batch_episodes=4)
-QUICK["repr_dir"] = "runs/{env_id}__aib_repr_quick__{seed}"
+SMALL = dict(exp_name="aib_belief_small", num_updates=1500, batch_episodes=16, belief_lr=2e-3)
+SMALL |= dict(warmup_updates=4000, prior_nll=1.0)
+QUICK = dict(exp_name="aib_belief_quick", warmup_updates=2, num_updates=4, batch_episodes=4)
 
 
 # ---------------------------------------------------------------- networks
@@ -438,6 +411,9 @@ class EpisodeDataset:
             fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
             self.arrays[name] = x.to(device) if fits else x
 
+    def __len__(self) -> int:
+        return len(self.arrays["u"])
+
     def __call__(self, index: np.ndarray) -> dict[str, Tensor]:
         """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
         batch = {name: x[index].to(self.device) for name, x in self.arrays.items()}
@@ -449,25 +425,19 @@ class EpisodeDataset:
         return batch | {"u_0": self.arrays["u"][episode, 0].to(self.device), "t": torch.from_numpy(t).to(self.device)}
 
 
-def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
-    """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
-    path = Path(args.repr_dir.format(**vars(args)))
-    settings = QUICK if args.quick else SMALL if args.small else {}
-    default = settings.get("repr_dir", Args.repr_dir)  # a directory of another name is not made here
-    if args.repr_dir == default and not (path / "repr.pt").exists():
-        run_stage("aib_repr.py", args)
-    hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
-    task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
-    stored = load(path / "repr.pt", hint, kind="repr", **task)
-    stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())  # a belief is resumed on its own phi only
+def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]:
+    """Open stage 1's output: episodes with u = mean of phi(s), and repr.pt, checked by load."""
+    preset = "small" if args.small else "quick" if args.quick else ""
+    path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{preset and '_' + preset}__{args.seed}")
+    if not (path / "repr.pt").exists():
+        command = f"python aib_repr.py --env-id {args.env_id} --seed {args.seed} {preset and '--' + preset}"
+        fail(f"{path / 'repr.pt'} does not exist; correct --repr-dir, or run first: {command}")
+    stored = load(path / "repr.pt", **expected)
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
-    try:
-        with torch.no_grad():
-            u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
-        return EpisodeDataset(path / "dataset", u, args.device), stored
-    except (OSError, ValueError) as error:
-        fail(f"{path / 'dataset'} is damaged or incomplete ({error}); {hint}")
+    with torch.no_grad():
+        u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
+    return EpisodeDataset(path / "dataset", u, args.device), stored
 
 
 # ---------------------------------------------------------------- evaluation
@@ -574,15 +544,16 @@ def flow_gain(head: nn.Module, z: Tensor, action: Tensor) -> tuple[float, float]
 
 def main(args: Args) -> None:
     """Train the belief on whole episodes, report what it remembers of held-out ones."""
-    path = check_run(args)
-    if (path / "belief.pt").exists() and not args.overwrite:
-        print(f"{path / 'belief.pt'} is finished; --overwrite recreates it")
+    if args.device == "cuda" and not CUDA:
+        fail("torch sees no CUDA device here; use --device cpu")
+    episodes, stored = load_episodes(args, env_id=args.env_id)
+    path = open_run(args)
+    if (path / "belief.pt").exists():
+        print(f"{path / 'belief.pt'} is finished")
         return
-    episodes, stored = load_episodes(args)
-    open_run(path, args)
     num_val = stored["num_val"]
     # linear probes are fitted on fit_on and tested on test_on
-    train, fit_on, test_on = np.split(np.arange(args.num_episodes), [-num_val, -(num_val // 2)])
+    train, fit_on, test_on = np.split(np.arange(len(episodes)), [-num_val, -(num_val // 2)])
     sample = episodes(train[:1])
     action_dim = sample["actions"].shape[-1]
     config = {
@@ -609,8 +580,7 @@ def main(args: Args) -> None:
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     completed = 0
     if (path / "checkpoint.pt").exists():
-        hint = "start again with --overwrite"
-        checkpoint = load(path / "checkpoint.pt", hint, kind="checkpoint", repr_crc=stored["crc"])
+        checkpoint = load(path / "checkpoint.pt")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         completed = checkpoint["update"]
@@ -641,7 +611,7 @@ def main(args: Args) -> None:
             for name, value in losses.items():
                 writer.add_scalar(f"belief/{name}", value, update)
 
-        if update % args.val_every == 0 or update == num_updates:
+        if update % VAL_EVERY == 0 or update == num_updates:
             held_out = encode(model["belief"], model["posterior"], episodes, test_on)
             error = (held_out["u"] - held_out["u_prior"]).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
@@ -650,7 +620,7 @@ def main(args: Args) -> None:
             bar.set_postfix(held_out_error=f"{error:.3f}")
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            save(path / "checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
+            save(path / "checkpoint.pt", checkpoint)
 
     # no early stopping: held-out error and likelihood are best before h holds the cue
     fit = encode(model["belief"], model["posterior"], episodes, fit_on)
@@ -660,13 +630,14 @@ def main(args: Args) -> None:
         report["flow_loss"], report["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["actions"])
     writer.close()
     save(path / "diagnostics.json", json.dumps(report, indent=2).encode())
-    content = {"kind": "aib_belief", **asdict(args), "config": config}
+    content = {**asdict(args), "config": config}
+    content |= {name: stored[name] for name in ("robot_triangles", "image_size")}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
     known = [f"{name} {report[name][-1]:.2f}" for name in ("cue_from_u", "cue_from_particle", "u_r2_prior")]
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: {', '.join(known)}")
 
 
-# ---------------------------------------------------------------- files and stages
+# ---------------------------------------------------------------- files
 # identical in all scripts that have them
 
 
@@ -683,108 +654,65 @@ def parse_args() -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")
-    if set("/{}") & set(args.exp_name):
-        fail(f"--exp-name {args.exp_name} must be a folder's name, without / and braces")
+    if "/" in args.exp_name:
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        flag = f"--{name.replace('_', '-')} {value}"
-        low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
-        if isinstance(value, int | float) and not low <= value <= high:
-            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
-            fail(f"{flag} must be {bounds}")
-        try:
-            str(value).format(**vars(args))  # paths may contain {env_id} and {seed}
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-            fail(f"{flag} has braces around what is no argument's name; {{env_id}} and {{seed}} are")
-    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
-        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
-    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
-        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+        if isinstance(value, int | float) and not value >= 0:
+            fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
 
-def check_run(args: Args) -> Path:
-    """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
-    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
-    if (path / "args.json").exists() and not args.overwrite:
-        recorded, given, changed = json.loads((path / "args.json").read_text()), asdict(args), []
-        if not recorded:
-            fail(f"{path} is half deleted, by a run with --overwrite that was stopped; give --overwrite again")
-        for name in recorded | given:  # another script's run has others
-            if name not in MAY_DIFFER and recorded.get(name) != given.get(name):
-                changed.append(f"{name}={recorded.get(name)} there, {given.get(name)} here")
-        if changed:
-            fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
-    return path
+def open_run(args: Args) -> Path:
+    """Make runs/{env_id}__{exp_name}__{seed} and lock it until this process ends.
 
-
-def open_run(path: Path, args: Args) -> None:
-    """Make the run's directory and lock it until this process ends; fails when another process holds the lock.
-
-    With --overwrite all that it holds is deleted, so call this only when all inputs have been read.
+    Fails when another process has the lock, or when the run was begun with other arguments.
     """
-    args_file = path / "args.json"
+    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
-        if args.overwrite:
-            save(args_file, b"{}")  # if the deletion is interrupted, check_run finds this and refuses to resume
-            for file in set(path.iterdir()) - {args_file}:
-                shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
-        save(args_file, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
+    given, changed = asdict(args), []
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+        for name, value in json.loads((path / "args.json").read_text()).items():
+            if name in given and name not in MAY_DIFFER and value != given[name]:
+                changed.append(f"{name}={value} there, {given[name]} here")
+    if changed:
+        fail(
+            f"{path} was begun with other arguments ({'; '.join(changed)}); "
+            f"delete it with rm -r {path}, or choose another --exp-name"
+        )
+    save(path / "args.json", json.dumps(given, indent=2).encode())
+    return path
 
 
 def save(path: Path, content: dict | bytes) -> None:
     """Write a .pt file (dict) or plain bytes whole or not at all: to a temporary name, then renamed."""
-    path.parent.mkdir(exist_ok=True)
     part = path.with_name(path.name + ".part")
-    if isinstance(content, dict):
-        torch.save({"format": FORMAT, **content}, part)
-    else:
-        part.write_bytes(content)
-    os.replace(part, path)
+    try:
+        path.parent.mkdir(exist_ok=True)
+        torch.save(content, part) if isinstance(content, dict) else part.write_bytes(content)
+        os.replace(part, path)
+    except (OSError, RuntimeError) as error:  # torch.save says of a full disk: RuntimeError
+        part.unlink(missing_ok=True)
+        free = shutil.disk_usage(path.parent).free / 1e6
+        fail(f"{path} cannot be written ({error}; {free:.0f} MB are free); make room, and the same command goes on")
 
 
-def load(path: Path, hint: str, **expected: object) -> dict:
-    """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
+def load(path: Path, **expected: object) -> dict:
+    """Read a .pt file that save wrote; fails where it is missing, or made for another task or picture (expected)."""
     if not path.exists():
         fail(f"{path} does not exist; run the script that writes it first, or correct the path")
-    expected = {"format": FORMAT, **expected}  # first, as another format explains all other differences
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        found = {name: content.get(name) for name in expected}
-    except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
-        fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
+    content = torch.load(path, map_location="cpu", weights_only=True)
     for name, value in expected.items():
-        if found[name] != value:
-            fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
+        if content.get(name) != value:
+            fail(f"{path} has {name} {content.get(name)}, this run needs {value}")
     return content
-
-
-def run_stage(script: str, args: Args) -> None:
-    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends and sizes."""
-    command = [sys.executable, str(Path(__file__).with_name(script))]
-    if args.small:
-        command.append("--small")
-    if args.quick:
-        command.append("--quick")
-    task = ("env_id", "seed", "robot_triangles", "image_size", "num_episodes")
-    for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
-        command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
-    print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
-    # prctl(PR_SET_PDEATHSIG, SIGKILL): the stage ends when this process is killed
-    stage = subprocess.Popen(command, preexec_fn=lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL))
-    try:
-        stage.wait()
-    except KeyboardInterrupt:
-        sys.exit(stage.wait() or 1)  # Ctrl-C has reached the stage, too, and the stage has said so
-    if stage.returncode:
-        sys.exit(stage.returncode)
 
 
 if __name__ == "__main__":
     try:
         main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from what was saved last")
+        sys.exit("\nstopped; the same command resumes the run from what was saved last")

@@ -44,7 +44,6 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 8  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
@@ -79,15 +78,11 @@ class Args:
     """a reduced setting for a CPU, by estimate 40 minutes for all stages of RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
-    overwrite: bool = False
-    """delete what the run directory holds, the episodes too, and start again; to resume, leave it out"""
 
     num_envs: int = 50
     """at most this many scenes at a time; physx_cuda draws one arm pose for all of them"""
     num_episodes: int = 2000
     """episodes of the random policy; 640 are enough for RememberColor3-v0, not for harder tasks"""
-    val_fraction: float = 0.1
-    """fraction of the episodes held out for validation"""
     epochs: int = 200
     """passes over the training transitions"""
     batch_size: int = 500
@@ -102,26 +97,19 @@ class Args:
     """lambda_s"""
     obs_coef: float = 0.03
     """lambda_o"""
-    kl_coef: float = 0.01
-    """lambda_KL; with 0.03, the paper's, u is more compact and may hold less of the cue"""
-    reward_norm: bool = True
-    """standardise rewards; without it the reward term of a random policy is next to nothing"""
-    kl_reduction: Literal["sum", "mean"] = "sum"
-    """over u's dimensions: sum is the paper's formula, mean what Believer's code does"""
+    kl_coef: float = 0.03
+    """lambda_KL, of the KL's mean over u's dimensions, as in Believer's code"""
     psi_images: bool = True
     """psi sees image and joints, as in the paper; without images a CPU is many times faster"""
     amp: bool = BFLOAT16
     """image network in bfloat16"""
 
 
-# (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
-LIMITS |= dict(val_fraction=(0, 1))
-MAY_DIFFER = ("overwrite", "num_workers")  # when a run is resumed
+MAY_DIFFER = "num_workers"  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, batch_size=100, learning_rate=1e-3)
-SMALL |= dict(image_size=64, epochs=7, kl_coef=0.003)
-QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, val_fraction=0.5, epochs=2)
+SMALL |= dict(image_size=64, epochs=7)
+QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, epochs=2)
 
 
 # ---------------------------------------------------------------- networks
@@ -243,8 +231,7 @@ def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> d
     loss_r = ((batch["rewards"] - g.reward_mean) / g.reward_std - r_hat).square().mean()  # line 7
     loss_s = (s_next - s_hat).square().sum(-1).mean()  # line 8
     loss_o = (o_next - o_hat).square().sum(-1).mean()  # line 9
-    kl = kl_divergence(q_s, Normal(0.0, 1.0))  # line 10
-    kl = kl.sum(-1).mean() if args.kl_reduction == "sum" else kl.mean()
+    kl = kl_divergence(q_s, Normal(0.0, 1.0)).mean()  # line 10; a mean over dimensions, too
     # line 11
     total = args.reward_coef * loss_r + args.state_coef * loss_s + args.obs_coef * loss_o + args.kl_coef * kl
     return {"reward": loss_r, "state": loss_s, "obs": loss_o, "kl": kl, "total": total}
@@ -259,13 +246,24 @@ def random_actions(args: Args, episode: int, steps: int, action_dim: int) -> np.
     return rng.uniform(-1, 1, (steps, action_dim)).astype(np.float32)
 
 
+def reserve(file: Path) -> None:
+    """Give a sparse file all its bytes: written through a memory map, a full disk would kill the process."""
+    size = file.stat().st_size
+    try:
+        with file.open("rb+") as opened:
+            os.posix_fallocate(opened.fileno(), 0, size)
+    except OSError as error:
+        shutil.rmtree(file.parent)  # incomplete without this array
+        fail(f"{file} needs {size / 1e9:.1f} GB ({error.strerror}); make room or lower --num-episodes")
+
+
 def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     """Play N whole episodes with uniformly random actions into dataset/, from where it stopped. Returns its arrays:
 
     rgb (N, T+1, H, W, 3) uint8; joints, state (N, T+1, .); actions (N, T, A); rewards, success (N, T); cue, the memory
     variable (N, K).
     """
-    meta, arrays = {"format": FORMAT, **asdict(args), "episodes_done": 0}, {}
+    meta, arrays = {**asdict(args), "episodes_done": 0}, {}
     if (path / "meta.json").exists():
         meta = json.loads((path / "meta.json").read_text())
         arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy")}
@@ -290,6 +288,7 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
             for name, shape in shapes.items():
                 dtype = {"rgb": np.uint8, "success": np.bool_}.get(name, np.float32)
                 arrays[name] = np.lib.format.open_memmap(path / f"{name}.npy", "w+", dtype, (count, *shape))
+                reserve(path / f"{name}.npy")
         arrays["cue"][kept], arrays["actions"][kept] = cue[: len(kept)], actions[: len(kept)]
         for t in range(steps + 1):
             for name, x in frame.items():
@@ -335,29 +334,20 @@ class TransitionDataset:
 
 def main(args: Args) -> None:
     """Collect the dataset, train phi, psi and g by Algorithm 1, write repr.pt."""
-    num_val = round(args.num_episodes * args.val_fraction)
-    if not 4 <= num_val < args.num_episodes:  # stage 2 fits linear probes on half, tests on the other
-        fail(
-            f"--val-fraction {args.val_fraction} must hold out 4 or more of --num-episodes {args.num_episodes}, not all"
-        )
-    path = check_run(args)
-    if (path / "repr.pt").exists() and not args.overwrite:
-        print(f"{path / 'repr.pt'} is finished; --overwrite recreates it")
-        return
     check_task(args)
-    meta = path / "dataset" / "meta.json"  # check_run has not seen it: dataset/ may be a copy from another run
-    if meta.exists() and not args.overwrite:
-        found, needed = json.loads(meta.read_text()), {"format": FORMAT, **asdict(args)}
-        for name in ("format", "env_id", "robot_triangles", "image_size", "num_episodes"):
-            if found.get(name) != needed[name]:
-                fail(f"{path} has {name} {found.get(name)}, this run needs {needed[name]}; --overwrite deletes it")
-    elif not meta.exists():  # else the old pictures are deleted first
-        size = args.num_episodes * (gym.spec(args.env_id).max_episode_steps + 1) * args.image_size**2 * 3
-        if size > shutil.disk_usage("runs" if Path("runs").exists() else ".").free:
-            fail(f"the pictures take {size / 1e9:.1f} GB, more than the disk has; free some or lower --num-episodes")
-    open_run(path, args)
+    path = open_run(args)
+    if (path / "repr.pt").exists():
+        print(f"{path / 'repr.pt'} is finished")
+        return
+    meta = path / "dataset" / "meta.json"
+    if meta.exists():  # dataset/ may be a copy from another run
+        found = json.loads(meta.read_text())
+        for name in ("env_id", "robot_triangles", "image_size", "num_episodes"):
+            if found[name] != getattr(args, name):
+                fail(f"{meta.parent} has {name} {found[name]}, this run needs {getattr(args, name)}")
     arrays = collect_random_episodes(args, path / "dataset")
     transitions = TransitionDataset(path / "dataset", args.psi_images, args.device)
+    num_val = max(4, args.num_episodes // 10)  # held out from stages 1 and 2: the last ones
     train = {name: x[:-num_val] for name, x in arrays.items()}
     steps, action_dim = arrays["actions"].shape[1:]
 
@@ -374,15 +364,15 @@ def main(args: Args) -> None:
     frames = np.array(train["rgb"][:128, ::8], np.float32)  # a sample that fits into memory
     psi.image_mean = torch.from_numpy(frames.mean((0, 1)))
     psi.image_std = torch.tensor((frames - frames.mean((0, 1))).std())
-    if args.reward_norm:
-        g.reward_mean.fill_(train["rewards"].mean(dtype=np.float64))
-        g.reward_std.fill_(train["rewards"].std(dtype=np.float64) + 1e-8)
+    # without this the reward term of a random policy is next to nothing
+    g.reward_mean.fill_(train["rewards"].mean(dtype=np.float64))
+    g.reward_std.fill_(train["rewards"].std(dtype=np.float64) + 1e-8)
     model = nn.ModuleDict({"phi": phi, "psi": psi, "g": g}).to(args.device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
     train_inds, val_inds = np.split(np.arange(args.num_episodes * steps), [-num_val * steps])
     updates_per_epoch, completed = math.ceil(len(train_inds) / args.batch_size), 0
     if (path / "checkpoint.pt").exists():
-        checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint")
+        checkpoint = load(path / "checkpoint.pt")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         completed = checkpoint["epoch"]
@@ -413,10 +403,10 @@ def main(args: Args) -> None:
             writer.add_scalar(f"held_out/{name}", val_losses[name], update)
         writer.flush()
         checkpoint = {"epoch": epoch + 1, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-        save(path / "checkpoint.pt", {"kind": "checkpoint", **checkpoint})
+        save(path / "checkpoint.pt", checkpoint)
 
-    content = {"kind": "repr", **asdict(args), "num_val": num_val}
-    save(path / "repr.pt", {**content, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())})
+    content = {**asdict(args), "num_val": num_val, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())}
+    save(path / "repr.pt", content)
     print(f"{path / 'repr.pt'} is finished")
 
 
@@ -560,7 +550,13 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 
 def check_task(args: Args) -> None:
-    """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
+    """Fail on an unknown task, assets that are not on this machine, and where simulator or renderer do not start."""
+    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
+        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
+    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
+        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+    if args.image_size < 36:
+        fail(f"--image-size {args.image_size} must be at least 36, for the image network")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         nearest = difflib.get_close_matches(args.env_id, tasks) or sorted(tasks)
@@ -578,7 +574,7 @@ def check_task(args: Args) -> None:
         fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see docs/experiments.md")
 
 
-# ---------------------------------------------------------------- files and stages
+# ---------------------------------------------------------------- files
 # identical in all scripts that have them
 
 
@@ -595,82 +591,60 @@ def parse_args() -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")
-    if set("/{}") & set(args.exp_name):
-        fail(f"--exp-name {args.exp_name} must be a folder's name, without / and braces")
+    if "/" in args.exp_name:
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        flag = f"--{name.replace('_', '-')} {value}"
-        low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
-        if isinstance(value, int | float) and not low <= value <= high:
-            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
-            fail(f"{flag} must be {bounds}")
-        try:
-            str(value).format(**vars(args))  # paths may contain {env_id} and {seed}
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-            fail(f"{flag} has braces around what is no argument's name; {{env_id}} and {{seed}} are")
-    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
-        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
-    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
-        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+        if isinstance(value, int | float) and not value >= 0:
+            fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
 
-def check_run(args: Args) -> Path:
-    """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
-    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
-    if (path / "args.json").exists() and not args.overwrite:
-        recorded, given, changed = json.loads((path / "args.json").read_text()), asdict(args), []
-        if not recorded:
-            fail(f"{path} is half deleted, by a run with --overwrite that was stopped; give --overwrite again")
-        for name in recorded | given:  # another script's run has others
-            if name not in MAY_DIFFER and recorded.get(name) != given.get(name):
-                changed.append(f"{name}={recorded.get(name)} there, {given.get(name)} here")
-        if changed:
-            fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
-    return path
+def open_run(args: Args) -> Path:
+    """Make runs/{env_id}__{exp_name}__{seed} and lock it until this process ends.
 
-
-def open_run(path: Path, args: Args) -> None:
-    """Make the run's directory and lock it until this process ends; fails when another process holds the lock.
-
-    With --overwrite all that it holds is deleted, so call this only when all inputs have been read.
+    Fails when another process has the lock, or when the run was begun with other arguments.
     """
-    args_file = path / "args.json"
+    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
-        if args.overwrite:
-            save(args_file, b"{}")  # if the deletion is interrupted, check_run finds this and refuses to resume
-            for file in set(path.iterdir()) - {args_file}:
-                shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
-        save(args_file, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
+    given, changed = asdict(args), []
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+        for name, value in json.loads((path / "args.json").read_text()).items():
+            if name in given and name not in MAY_DIFFER and value != given[name]:
+                changed.append(f"{name}={value} there, {given[name]} here")
+    if changed:
+        fail(
+            f"{path} was begun with other arguments ({'; '.join(changed)}); "
+            f"delete it with rm -r {path}, or choose another --exp-name"
+        )
+    save(path / "args.json", json.dumps(given, indent=2).encode())
+    return path
 
 
 def save(path: Path, content: dict | bytes) -> None:
     """Write a .pt file (dict) or plain bytes whole or not at all: to a temporary name, then renamed."""
-    path.parent.mkdir(exist_ok=True)
     part = path.with_name(path.name + ".part")
-    if isinstance(content, dict):
-        torch.save({"format": FORMAT, **content}, part)
-    else:
-        part.write_bytes(content)
-    os.replace(part, path)
+    try:
+        path.parent.mkdir(exist_ok=True)
+        torch.save(content, part) if isinstance(content, dict) else part.write_bytes(content)
+        os.replace(part, path)
+    except (OSError, RuntimeError) as error:  # torch.save says of a full disk: RuntimeError
+        part.unlink(missing_ok=True)
+        free = shutil.disk_usage(path.parent).free / 1e6
+        fail(f"{path} cannot be written ({error}; {free:.0f} MB are free); make room, and the same command goes on")
 
 
-def load(path: Path, hint: str, **expected: object) -> dict:
-    """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
+def load(path: Path, **expected: object) -> dict:
+    """Read a .pt file that save wrote; fails where it is missing, or made for another task or picture (expected)."""
     if not path.exists():
         fail(f"{path} does not exist; run the script that writes it first, or correct the path")
-    expected = {"format": FORMAT, **expected}  # first, as another format explains all other differences
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        found = {name: content.get(name) for name in expected}
-    except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
-        fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
+    content = torch.load(path, map_location="cpu", weights_only=True)
     for name, value in expected.items():
-        if found[name] != value:
-            fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
+        if content.get(name) != value:
+            fail(f"{path} has {name} {content.get(name)}, this run needs {value}")
     return content
 
 
@@ -678,4 +652,4 @@ if __name__ == "__main__":
     try:
         main(parse_args())
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from what was saved last")
+        sys.exit("\nstopped; the same command resumes the run from what was saved last")

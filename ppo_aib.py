@@ -11,7 +11,6 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, Tensor
          checkpoint.pt to resume; with --evaluate evaluation.json and .mp4 beside agent.pt
 """
 
-import ctypes
 import difflib
 import fcntl
 import json
@@ -27,7 +26,6 @@ import sys
 import tempfile
 import time
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
@@ -54,11 +52,11 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 8  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
     BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
+SIMULATOR = ["robot_triangles", "image_size", "sim_backend", "render_backend", "num_workers"]  # its arguments
 EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; PPO trains on those below 2**30, stage 1 has those between
 TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, never used for training or tuning
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -91,17 +89,11 @@ class Args:
     """a reduced setting for a CPU, by estimate 40 minutes for all stages of RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
-    overwrite: bool = False
-    """delete what the run directory holds and start again; to resume, leave it out"""
 
-    belief: str = "runs/{env_id}__aib_belief__{seed}/belief.pt"
-    """belief.pt of stage 2; only the default is made where it is missing"""
-    num_episodes: int = 2000
-    """random episodes of stage 1, made if they are missing; must be the number that the belief was trained with"""
+    belief: str | None = None
+    """belief.pt of stage 2; by default that of the same task, preset and seed, which is made where it is missing"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
-    sample_decoder: bool = True
-    """draw each particle from the decoder's Gaussian; without it, take its mean"""
     total_timesteps: int = 10_000_000
     """environment steps of training; a finished run goes on with a larger number"""
     num_envs: int = 256
@@ -144,16 +136,11 @@ class Args:
     """image network of the policy in bfloat16"""
     evaluate: bool = False
     """only evaluate --checkpoint; it keeps its task, image_size, robot_triangles, num_envs, amp and particles"""
-    checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
-    """the agent that --evaluate evaluates"""
+    checkpoint: str | None = None
+    """the agent.pt that --evaluate evaluates; by default this run's"""
 
 
-# (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
-LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
-LIMITS |= dict(init_std=(0.001, math.inf))
-LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
-MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
+MAY_DIFFER = ("num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5, where it differs from the defaults above; any other task has InterceptFast-v0's, the defaults
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
@@ -161,9 +148,7 @@ TASKS = {  # Table 5, where it differs from the defaults above; any other task h
 SMALL = dict(exp_name="ppo_aib_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, reward_norm=True, joints_norm=True)
 SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
-SMALL |= dict(num_episodes=640, belief="runs/{env_id}__aib_belief_small__{seed}/belief.pt")
 QUICK = dict(exp_name="ppo_aib_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
-QUICK |= dict(num_episodes=8, belief="runs/{env_id}__aib_belief_quick__{seed}/belief.pt")
 
 
 # ---------------------------------------------------------------- networks
@@ -419,8 +404,6 @@ def rollout(
     shape = (steps + 1, num_episodes, args.num_particles)
     z_noise = torch.randn(*shape, agent.belief.config["z_dim"], device=device)
     u_noise = torch.randn(*shape, agent.belief.config["u_dim"], device=device)
-    if not args.sample_decoder:
-        u_noise.zero_()
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     desc = "evaluation" if deterministic else "rollout"
     for first in range(0, num_episodes, envs.num_envs):
@@ -454,17 +437,17 @@ def rollout(
     return buffer
 
 
-def load_belief(args: Args, resume: bool) -> dict:
-    """Read stage 2's belief.pt, made first where it is missing; main refuses to resume with another than at first."""
-    file = Path(args.belief.format(**vars(args)))
-    settings = QUICK if args.quick else SMALL if args.small else {}
-    default = settings.get("belief", Args.belief)  # a file of another name is not made here
-    if args.belief == default and not file.exists() and not resume:
-        run_stage("aib_belief.py", args)
-    hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_belief.py --overwrite"
-    task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
-    stored = load(file, hint, kind="aib_belief", **task)
-    return stored | {"crc": zlib.crc32(file.read_bytes())}
+def load_belief(args: Args) -> dict:
+    """Read stage 2's belief.pt; the default is made where it is missing, by stages 1 and 2."""
+    preset = "_quick" if args.quick else "_small" if args.small else ""
+    file = Path(args.belief or f"runs/{args.env_id}__aib_belief{preset}__{args.seed}/belief.pt")
+    if not args.belief and not file.exists():
+        run_stage(
+            "aib_repr.py", args, ["robot_triangles", "image_size", "sim_backend", "render_backend", "num_workers"]
+        )
+        run_stage("aib_belief.py", args, [])
+    task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size")}
+    return load(file, **task)
 
 
 # ---------------------------------------------------------------- evaluation
@@ -516,9 +499,11 @@ def evaluate(
 
 def evaluate_checkpoint(args: Args) -> None:
     """Evaluate the agent of --checkpoint, on test episodes; writes evaluation.json and .mp4 beside it."""
-    file = Path(args.checkpoint.format(**vars(args)))
-    stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_aib agent")
-    for name in ("env_id", "robot_triangles", "image_size", "num_envs", "amp", "num_particles", "sample_decoder"):
+    file = Path(args.checkpoint or f"runs/{args.env_id}__{args.exp_name}__{args.seed}/agent.pt")
+    stored = load(file, script="ppo_aib")
+    if not os.access(file.parent, os.W_OK):
+        fail(f"{file.parent} cannot be written, where evaluation.json and .mp4 would be; copy {file.name} elsewhere")
+    for name in ("env_id", "robot_triangles", "image_size", "num_envs", "amp", "num_particles"):
         setattr(args, name, stored[name])
     check_task(args)
     envs = make_envs(args)
@@ -540,19 +525,18 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // batch_size)
     if args.num_minibatches > batch_size:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {batch_size} steps of an iteration")
+    if max(args.gamma, args.gae_lambda) > 1:
+        fail(f"--gamma {args.gamma} and --gae-lambda {args.gae_lambda} must be at most 1")
     if args.total_timesteps > 1_000_000 and not CUDA:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes some 40 minutes", flush=True)
-    path = check_run(args)
-    resume = (path / "checkpoint.pt").exists() and not args.overwrite
-    checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
+    path = open_run(args)
+    checkpoint = load(path / "checkpoint.pt") if (path / "checkpoint.pt").exists() else {}
+    if (path / "agent.pt").exists() and not checkpoint:
+        fail(f"{path} has results and no checkpoint.pt to go on from; choose another --exp-name")
     if checkpoint.get("iteration", 0) >= num_iterations:
-        print(f"{path} is finished; --overwrite recreates it, a larger --total-timesteps continues it")
+        print(f"{path} is finished; a larger --total-timesteps continues it")
         return
-    stored = load_belief(args, resume)
-    if resume and checkpoint.get("belief_crc") != stored["crc"]:
-        file = args.belief.format(**vars(args))
-        fail(f"{path} began with another belief than {file}; use --overwrite or another --exp-name")
-    open_run(path, args)
+    stored = load_belief(args)
 
     envs = make_envs(args)
     torch.manual_seed(args.seed)
@@ -564,7 +548,7 @@ def main(args: Args) -> None:
     completed, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     reward_var = checkpoint.get("reward_var", 0.0)
     if checkpoint:
-        agent.load_state_dict(checkpoint["agent"])
+        agent.load_state_dict(checkpoint["agent"], strict=False)  # without the belief
         optimizer.load_state_dict(checkpoint["optimizer"])
         print(f"resuming {path} at step {completed * batch_size:,}", flush=True)
     writer = SummaryWriter(path, purge_step=completed * batch_size + 1)
@@ -622,15 +606,16 @@ def main(args: Args) -> None:
                 lines.append(",".join(map(str, row.values())))
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"kind": "ppo_aib agent", **asdict(args), "config": stored["config"]}
+            content = {"script": "ppo_aib", **asdict(args), "config": stored["config"]}
             save(path / "agent.pt", {**content, "global_step": global_step, "agent": agent.state_dict()})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
 
         for name, value in scalars.items():
             writer.add_scalar(name, value, global_step)
         writer.flush()
-        states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "reward_var": reward_var}
-        states |= {"kind": "checkpoint", "iteration": iteration, "rows": evals, "belief_crc": stored["crc"]}
+        trained = {name: x for name, x in agent.state_dict().items() if not name.startswith("belief.")}
+        states = {"agent": trained, "optimizer": optimizer.state_dict(), "reward_var": reward_var}
+        states |= {"iteration": iteration, "rows": evals}
         save(path / "checkpoint.pt", states)
     envs.close()
     for name in ("success_once", "success_at_end", "return"):
@@ -778,7 +763,13 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 
 def check_task(args: Args) -> None:
-    """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
+    """Fail on an unknown task, assets that are not on this machine, and where simulator or renderer do not start."""
+    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
+        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
+    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
+        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+    if args.image_size < 36:
+        fail(f"--image-size {args.image_size} must be at least 36, for the image network")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         nearest = difflib.get_close_matches(args.env_id, tasks) or sorted(tasks)
@@ -796,7 +787,7 @@ def check_task(args: Args) -> None:
         fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see docs/experiments.md")
 
 
-# ---------------------------------------------------------------- files and stages
+# ---------------------------------------------------------------- files
 # identical in all scripts that have them
 
 
@@ -813,104 +804,75 @@ def parse_args() -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")
-    if set("/{}") & set(args.exp_name):
-        fail(f"--exp-name {args.exp_name} must be a folder's name, without / and braces")
+    if "/" in args.exp_name:
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        flag = f"--{name.replace('_', '-')} {value}"
-        low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
-        if isinstance(value, int | float) and not low <= value <= high:
-            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
-            fail(f"{flag} must be {bounds}")
-        try:
-            str(value).format(**vars(args))  # paths may contain {env_id} and {seed}
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-            fail(f"{flag} has braces around what is no argument's name; {{env_id}} and {{seed}} are")
-    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
-        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
-    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
-        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+        if isinstance(value, int | float) and not value >= 0:
+            fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
 
-def check_run(args: Args) -> Path:
-    """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
-    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
-    if (path / "args.json").exists() and not args.overwrite:
-        recorded, given, changed = json.loads((path / "args.json").read_text()), asdict(args), []
-        if not recorded:
-            fail(f"{path} is half deleted, by a run with --overwrite that was stopped; give --overwrite again")
-        for name in recorded | given:  # another script's run has others
-            if name not in MAY_DIFFER and recorded.get(name) != given.get(name):
-                changed.append(f"{name}={recorded.get(name)} there, {given.get(name)} here")
-        if changed:
-            fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
-    return path
+def open_run(args: Args) -> Path:
+    """Make runs/{env_id}__{exp_name}__{seed} and lock it until this process ends.
 
-
-def open_run(path: Path, args: Args) -> None:
-    """Make the run's directory and lock it until this process ends; fails when another process holds the lock.
-
-    With --overwrite all that it holds is deleted, so call this only when all inputs have been read.
+    Fails when another process has the lock, or when the run was begun with other arguments.
     """
-    args_file = path / "args.json"
+    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
-        if args.overwrite:
-            save(args_file, b"{}")  # if the deletion is interrupted, check_run finds this and refuses to resume
-            for file in set(path.iterdir()) - {args_file}:
-                shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
-        save(args_file, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
+    given, changed = asdict(args), []
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+        for name, value in json.loads((path / "args.json").read_text()).items():
+            if name in given and name not in MAY_DIFFER and value != given[name]:
+                changed.append(f"{name}={value} there, {given[name]} here")
+    if changed:
+        fail(
+            f"{path} was begun with other arguments ({'; '.join(changed)}); "
+            f"delete it with rm -r {path}, or choose another --exp-name"
+        )
+    save(path / "args.json", json.dumps(given, indent=2).encode())
+    return path
 
 
 def save(path: Path, content: dict | bytes) -> None:
     """Write a .pt file (dict) or plain bytes whole or not at all: to a temporary name, then renamed."""
-    path.parent.mkdir(exist_ok=True)
     part = path.with_name(path.name + ".part")
-    if isinstance(content, dict):
-        torch.save({"format": FORMAT, **content}, part)
-    else:
-        part.write_bytes(content)
-    os.replace(part, path)
+    try:
+        path.parent.mkdir(exist_ok=True)
+        torch.save(content, part) if isinstance(content, dict) else part.write_bytes(content)
+        os.replace(part, path)
+    except (OSError, RuntimeError) as error:  # torch.save says of a full disk: RuntimeError
+        part.unlink(missing_ok=True)
+        free = shutil.disk_usage(path.parent).free / 1e6
+        fail(f"{path} cannot be written ({error}; {free:.0f} MB are free); make room, and the same command goes on")
 
 
-def load(path: Path, hint: str, **expected: object) -> dict:
-    """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
+def load(path: Path, **expected: object) -> dict:
+    """Read a .pt file that save wrote; fails where it is missing, or made for another task or picture (expected)."""
     if not path.exists():
         fail(f"{path} does not exist; run the script that writes it first, or correct the path")
-    expected = {"format": FORMAT, **expected}  # first, as another format explains all other differences
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        found = {name: content.get(name) for name in expected}
-    except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
-        fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
+    content = torch.load(path, map_location="cpu", weights_only=True)
     for name, value in expected.items():
-        if found[name] != value:
-            fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
+        if content.get(name) != value:
+            fail(f"{path} has {name} {content.get(name)}, this run needs {value}")
     return content
 
 
-def run_stage(script: str, args: Args) -> None:
-    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends and sizes."""
+def run_stage(script: str, args: Args, flags: list[str]) -> None:
+    """Run an earlier stage, whose output is missing, for the same preset, task and seed, with the same flags."""
     command = [sys.executable, str(Path(__file__).with_name(script))]
-    if args.small:
-        command.append("--small")
-    if args.quick:
-        command.append("--quick")
-    task = ("env_id", "seed", "robot_triangles", "image_size", "num_episodes")
-    for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
+    command += [f"--{preset}" for preset in ("small", "quick") if getattr(args, preset)]
+    for name in ["env_id", "seed", "device", *flags]:
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
-    # prctl(PR_SET_PDEATHSIG, SIGKILL): the stage ends when this process is killed
-    stage = subprocess.Popen(command, preexec_fn=lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL))
-    try:
-        stage.wait()
-    except KeyboardInterrupt:
-        sys.exit(stage.wait() or 1)  # Ctrl-C has reached the stage, too, and the stage has said so
-    if stage.returncode:
-        sys.exit(stage.returncode)
+    status = subprocess.run(command).returncode
+    if status < 0:
+        fail(f"{script} was killed by signal {-status}, perhaps as memory ran out; the same command goes on")
+    if status:
+        sys.exit(status)
 
 
 if __name__ == "__main__":
@@ -921,4 +883,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from what was saved last")
+        sys.exit("\nstopped; the same command resumes the run from what was saved last")

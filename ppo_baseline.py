@@ -44,7 +44,6 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 8  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
@@ -81,8 +80,6 @@ class Args:
     """a reduced setting for a CPU, by estimate 40 minutes for all stages of RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
-    overwrite: bool = False
-    """delete what the run directory holds and start again; to resume, leave it out"""
 
     total_timesteps: int = 10_000_000
     """environment steps of training; a finished run goes on with a larger number"""
@@ -126,16 +123,11 @@ class Args:
     """image network in bfloat16"""
     evaluate: bool = False
     """only evaluate --checkpoint; it keeps its task, image_size, robot_triangles, num_envs and amp"""
-    checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
-    """the agent that --evaluate evaluates"""
+    checkpoint: str | None = None
+    """the agent.pt that --evaluate evaluates; by default this run's"""
 
 
-# (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
-LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
-LIMITS |= dict(init_std=(0.001, math.inf))
-LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
-MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
+MAY_DIFFER = ("num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5, where it differs from the defaults above; any other task has InterceptFast-v0's, the defaults
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
@@ -331,8 +323,10 @@ def evaluate(
 
 def evaluate_checkpoint(args: Args) -> None:
     """Evaluate the agent of --checkpoint, on test episodes; writes evaluation.json and .mp4 beside it."""
-    file = Path(args.checkpoint.format(**vars(args)))
-    stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_baseline agent")
+    file = Path(args.checkpoint or f"runs/{args.env_id}__{args.exp_name}__{args.seed}/agent.pt")
+    stored = load(file, script="ppo_baseline")
+    if not os.access(file.parent, os.W_OK):
+        fail(f"{file.parent} cannot be written, where evaluation.json and .mp4 would be; copy {file.name} elsewhere")
     for name in ("env_id", "robot_triangles", "image_size", "num_envs", "amp"):
         setattr(args, name, stored[name])
     check_task(args)
@@ -355,15 +349,17 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // batch_size)
     if args.num_minibatches > batch_size:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {batch_size} steps of an iteration")
+    if max(args.gamma, args.gae_lambda) > 1:
+        fail(f"--gamma {args.gamma} and --gae-lambda {args.gae_lambda} must be at most 1")
     if args.total_timesteps > 1_000_000 and not CUDA:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes some 40 minutes", flush=True)
-    path = check_run(args)
-    resume = (path / "checkpoint.pt").exists() and not args.overwrite
-    checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
+    path = open_run(args)
+    checkpoint = load(path / "checkpoint.pt") if (path / "checkpoint.pt").exists() else {}
+    if (path / "agent.pt").exists() and not checkpoint:
+        fail(f"{path} has results and no checkpoint.pt to go on from; choose another --exp-name")
     if checkpoint.get("iteration", 0) >= num_iterations:
-        print(f"{path} is finished; --overwrite recreates it, a larger --total-timesteps continues it")
+        print(f"{path} is finished; a larger --total-timesteps continues it")
         return
-    open_run(path, args)
 
     envs = make_envs(args)
     torch.manual_seed(args.seed)
@@ -432,7 +428,7 @@ def main(args: Args) -> None:
                 lines.append(",".join(map(str, row.values())))
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"kind": "ppo_baseline agent", **asdict(args)}
+            content = {"script": "ppo_baseline", **asdict(args)}
             save(path / "agent.pt", {**content, "global_step": global_step, "agent": agent.state_dict()})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
 
@@ -440,7 +436,7 @@ def main(args: Args) -> None:
             writer.add_scalar(name, value, global_step)
         writer.flush()
         states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "reward_var": reward_var}
-        save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": evals, **states})
+        save(path / "checkpoint.pt", {"iteration": iteration, "rows": evals, **states})
     envs.close()
     for name in ("success_once", "success_at_end", "return"):
         values = [row[name] for row in evals]
@@ -587,7 +583,13 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 
 def check_task(args: Args) -> None:
-    """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
+    """Fail on an unknown task, assets that are not on this machine, and where simulator or renderer do not start."""
+    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
+        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
+    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
+        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+    if args.image_size < 36:
+        fail(f"--image-size {args.image_size} must be at least 36, for the image network")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         nearest = difflib.get_close_matches(args.env_id, tasks) or sorted(tasks)
@@ -605,7 +607,7 @@ def check_task(args: Args) -> None:
         fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see docs/experiments.md")
 
 
-# ---------------------------------------------------------------- files and stages
+# ---------------------------------------------------------------- files
 # identical in all scripts that have them
 
 
@@ -622,82 +624,60 @@ def parse_args() -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")
-    if set("/{}") & set(args.exp_name):
-        fail(f"--exp-name {args.exp_name} must be a folder's name, without / and braces")
+    if "/" in args.exp_name:
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        flag = f"--{name.replace('_', '-')} {value}"
-        low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
-        if isinstance(value, int | float) and not low <= value <= high:
-            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
-            fail(f"{flag} must be {bounds}")
-        try:
-            str(value).format(**vars(args))  # paths may contain {env_id} and {seed}
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-            fail(f"{flag} has braces around what is no argument's name; {{env_id}} and {{seed}} are")
-    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
-        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
-    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
-        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+        if isinstance(value, int | float) and not value >= 0:
+            fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
 
-def check_run(args: Args) -> Path:
-    """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
-    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
-    if (path / "args.json").exists() and not args.overwrite:
-        recorded, given, changed = json.loads((path / "args.json").read_text()), asdict(args), []
-        if not recorded:
-            fail(f"{path} is half deleted, by a run with --overwrite that was stopped; give --overwrite again")
-        for name in recorded | given:  # another script's run has others
-            if name not in MAY_DIFFER and recorded.get(name) != given.get(name):
-                changed.append(f"{name}={recorded.get(name)} there, {given.get(name)} here")
-        if changed:
-            fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
-    return path
+def open_run(args: Args) -> Path:
+    """Make runs/{env_id}__{exp_name}__{seed} and lock it until this process ends.
 
-
-def open_run(path: Path, args: Args) -> None:
-    """Make the run's directory and lock it until this process ends; fails when another process holds the lock.
-
-    With --overwrite all that it holds is deleted, so call this only when all inputs have been read.
+    Fails when another process has the lock, or when the run was begun with other arguments.
     """
-    args_file = path / "args.json"
+    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
-        if args.overwrite:
-            save(args_file, b"{}")  # if the deletion is interrupted, check_run finds this and refuses to resume
-            for file in set(path.iterdir()) - {args_file}:
-                shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
-        save(args_file, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
+    given, changed = asdict(args), []
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+        for name, value in json.loads((path / "args.json").read_text()).items():
+            if name in given and name not in MAY_DIFFER and value != given[name]:
+                changed.append(f"{name}={value} there, {given[name]} here")
+    if changed:
+        fail(
+            f"{path} was begun with other arguments ({'; '.join(changed)}); "
+            f"delete it with rm -r {path}, or choose another --exp-name"
+        )
+    save(path / "args.json", json.dumps(given, indent=2).encode())
+    return path
 
 
 def save(path: Path, content: dict | bytes) -> None:
     """Write a .pt file (dict) or plain bytes whole or not at all: to a temporary name, then renamed."""
-    path.parent.mkdir(exist_ok=True)
     part = path.with_name(path.name + ".part")
-    if isinstance(content, dict):
-        torch.save({"format": FORMAT, **content}, part)
-    else:
-        part.write_bytes(content)
-    os.replace(part, path)
+    try:
+        path.parent.mkdir(exist_ok=True)
+        torch.save(content, part) if isinstance(content, dict) else part.write_bytes(content)
+        os.replace(part, path)
+    except (OSError, RuntimeError) as error:  # torch.save says of a full disk: RuntimeError
+        part.unlink(missing_ok=True)
+        free = shutil.disk_usage(path.parent).free / 1e6
+        fail(f"{path} cannot be written ({error}; {free:.0f} MB are free); make room, and the same command goes on")
 
 
-def load(path: Path, hint: str, **expected: object) -> dict:
-    """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
+def load(path: Path, **expected: object) -> dict:
+    """Read a .pt file that save wrote; fails where it is missing, or made for another task or picture (expected)."""
     if not path.exists():
         fail(f"{path} does not exist; run the script that writes it first, or correct the path")
-    expected = {"format": FORMAT, **expected}  # first, as another format explains all other differences
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        found = {name: content.get(name) for name in expected}
-    except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
-        fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
+    content = torch.load(path, map_location="cpu", weights_only=True)
     for name, value in expected.items():
-        if found[name] != value:
-            fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
+        if content.get(name) != value:
+            fail(f"{path} has {name} {content.get(name)}, this run needs {value}")
     return content
 
 
@@ -709,4 +689,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from what was saved last")
+        sys.exit("\nstopped; the same command resumes the run from what was saved last")

@@ -11,7 +11,6 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, agent.pt, eval.csv, vide
          evaluation.json and .mp4 beside agent.pt
 """
 
-import ctypes
 import difflib
 import fcntl
 import json
@@ -19,15 +18,12 @@ import math
 import multiprocessing
 import os
 import re
-import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
@@ -54,8 +50,8 @@ from torch.distributions import Normal, kl_divergence
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-FORMAT = 8  # of every .pt file and of dataset/; other formats are refused
 CUDA = torch.cuda.is_available()
+VAL_EVERY = 250  # updates of the belief between checkpoints, each with a validation
 IMAGE_CHUNK = 4096 if CUDA else 64  # images through the history encoder at a time: what a CPU's cache holds
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
@@ -92,13 +88,9 @@ class Args:
     """a reduced setting for a CPU, by estimate 40 minutes for all stages of RememberColor3-v0"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
-    overwrite: bool = False
-    """delete what the run directory holds and start again; to resume, leave it out"""
 
-    repr_dir: str = "runs/{env_id}__aib_repr__{seed}"
-    """run directory of stage 1"""
-    num_episodes: int = 2000
-    """random episodes of stage 1, made if they are missing; must be the number that its dataset has"""
+    repr_dir: str | None = None
+    """run directory of stage 1; by default that of the same task, preset and seed"""
     num_updates: int = 10_000
     """gradient updates of the belief; the paper's 10,000 epochs (Table 2) are taken to be updates"""
     batch_episodes: int = 256
@@ -115,13 +107,11 @@ class Args:
     """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
     prior_nll: float = 0.0
     """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
-    val_every: int = 50
-    """updates between checkpoints, each with a validation"""
 
+    belief: str | None = None
+    """belief.pt of another run of this script; by default this run trains its own"""
     num_particles: int = 30
     """particles drawn from the belief at every step"""
-    sample_decoder: bool = True
-    """draw each particle from the decoder's Gaussian; without it, take its mean"""
     total_timesteps: int = 10_000_000
     """environment steps of training; a finished run goes on with a larger number"""
     num_envs: int = 256
@@ -164,17 +154,11 @@ class Args:
     """image network of the policy in bfloat16"""
     evaluate: bool = False
     """only evaluate --checkpoint; it keeps its task, image_size, robot_triangles, num_envs, amp and particles"""
-    checkpoint: str = "runs/{env_id}__{exp_name}__{seed}/agent.pt"
-    """the agent that --evaluate evaluates"""
+    checkpoint: str | None = None
+    """the agent.pt that --evaluate evaluates; by default this run's"""
 
 
-# (lowest, highest) allowed; of arguments not named here: integers at least 1, floats at least 0
-LIMITS = dict(seed=(0, 10**12), robot_triangles=(0, math.inf), image_size=(36, math.inf))
-LIMITS |= dict(gamma=(0, 1), gae_lambda=(0, 1), noise_beta=(0, 2))
-LIMITS |= dict(init_std=(0.001, math.inf))
-LIMITS |= dict(target_kl=(1e-6, math.inf), num_eval_episodes=(2, math.inf))
-LIMITS |= dict(image_mask=(0, 1), warmup_updates=(0, math.inf))
-MAY_DIFFER = ("overwrite", "num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
+MAY_DIFFER = ("num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
 TASKS = {  # Table 5, where it differs from the defaults above; any other task has InterceptFast-v0's, the defaults
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
@@ -182,11 +166,10 @@ TASKS = {  # Table 5, where it differs from the defaults above; any other task h
 SMALL = dict(exp_name="ppo_believer_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
 SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, reward_norm=True, joints_norm=True)
 SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
-SMALL |= dict(num_episodes=640, num_updates=1500, batch_episodes=16, belief_lr=2e-3)
-SMALL |= dict(warmup_updates=4000, prior_nll=1.0, val_every=250)
-SMALL["repr_dir"] = "runs/{env_id}__aib_repr_small__{seed}"
+SMALL |= dict(num_updates=1500, batch_episodes=16, belief_lr=2e-3)
+SMALL |= dict(warmup_updates=4000, prior_nll=1.0)
 QUICK = dict(exp_name="ppo_believer_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
-QUICK |= dict(repr_dir="runs/{env_id}__aib_repr_quick__{seed}", num_episodes=8, num_updates=4, batch_episodes=4)
+QUICK |= dict(num_updates=4, batch_episodes=4)
 QUICK["warmup_updates"] = 2
 
 
@@ -534,6 +517,9 @@ class EpisodeDataset:
             fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
             self.arrays[name] = x.to(device) if fits else x
 
+    def __len__(self) -> int:
+        return len(self.arrays["u"])
+
     def __call__(self, index: np.ndarray) -> dict[str, Tensor]:
         """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
         batch = {name: x[index].to(self.device) for name, x in self.arrays.items()}
@@ -545,25 +531,19 @@ class EpisodeDataset:
         return batch | {"u_0": self.arrays["u"][episode, 0].to(self.device), "t": torch.from_numpy(t).to(self.device)}
 
 
-def load_episodes(args: Args) -> tuple[EpisodeDataset, dict]:
-    """Open stage 1's output, made first where it is missing: episodes with u = mean of phi(s), and repr.pt."""
-    path = Path(args.repr_dir.format(**vars(args)))
-    settings = QUICK if args.quick else SMALL if args.small else {}
-    default = settings.get("repr_dir", Args.repr_dir)  # a directory of another name is not made here
-    if args.repr_dir == default and not (path / "repr.pt").exists():
-        run_stage("aib_repr.py", args)
-    hint = "give here what it was made with (--num-episodes, ...) or recreate it with aib_repr.py --overwrite"
-    task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
-    stored = load(path / "repr.pt", hint, kind="repr", **task)
-    stored["crc"] = zlib.crc32((path / "repr.pt").read_bytes())  # a belief is resumed on its own phi only
+def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]:
+    """Open stage 1's output: episodes with u = mean of phi(s), and repr.pt, checked by load."""
+    preset = "small" if args.small else "quick" if args.quick else ""
+    path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{preset and '_' + preset}__{args.seed}")
+    if not (path / "repr.pt").exists():
+        command = f"python aib_repr.py --env-id {args.env_id} --seed {args.seed} {preset and '--' + preset}"
+        fail(f"{path / 'repr.pt'} does not exist; correct --repr-dir, or run first: {command}")
+    stored = load(path / "repr.pt", **expected)
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
-    try:
-        with torch.no_grad():
-            u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
-        return EpisodeDataset(path / "dataset", u, args.device), stored
-    except (OSError, ValueError) as error:
-        fail(f"{path / 'dataset'} is damaged or incomplete ({error}); {hint}")
+    with torch.no_grad():
+        u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
+    return EpisodeDataset(path / "dataset", u, args.device), stored
 
 
 def colored_noise(beta: float, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
@@ -595,8 +575,6 @@ def rollout(
     shape = (steps + 1, num_episodes, args.num_particles)
     z_noise = torch.randn(*shape, agent.belief.config["z_dim"], device=device)
     u_noise = torch.randn(*shape, agent.belief.config["u_dim"], device=device)
-    if not args.sample_decoder:
-        u_noise.zero_()
     buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     desc = "evaluation" if deterministic else "rollout"
     for first in range(0, num_episodes, envs.num_envs):
@@ -695,11 +673,13 @@ def evaluate(
 # ---------------------------------------------------------------- training
 
 
-def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict) -> None:
+def train_belief(args: Args, path: Path) -> None:
     """Train Believer's belief on stage 1's output as aib_belief.py does; writes belief.pt into path."""
+    task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size")}
+    episodes, stored = load_episodes(args, **task)
     num_val = stored["num_val"]
     # aib_belief.py fits its linear probes on the episodes between the two
-    train, _, test_on = np.split(np.arange(args.num_episodes), [-num_val, -(num_val // 2)])
+    train, _, test_on = np.split(np.arange(len(episodes)), [-num_val, -(num_val // 2)])
     sample = episodes(train[:1])
     config = {
         "image_shape": list(sample["rgb"].shape[2:]),
@@ -721,8 +701,7 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)
     completed = 0
     if (path / "belief_checkpoint.pt").exists():
-        hint = "start again with --overwrite"
-        checkpoint = load(path / "belief_checkpoint.pt", hint, kind="checkpoint", repr_crc=stored["crc"])
+        checkpoint = load(path / "belief_checkpoint.pt")
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
         completed = checkpoint["update"]
@@ -753,18 +732,18 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
             for name, value in losses.items():
                 writer.add_scalar(f"belief/{name}", value, update)
 
-        if update % args.val_every == 0 or update == num_updates:
+        if update % VAL_EVERY == 0 or update == num_updates:
             u, estimate = validate_belief(model["belief"], episodes, test_on)
             error = (u - estimate).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
             bar.set_postfix(held_out_error=f"{error:.3f}")
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-            save(path / "belief_checkpoint.pt", {"kind": "checkpoint", "repr_crc": stored["crc"], **checkpoint})
+            save(path / "belief_checkpoint.pt", checkpoint)
 
     # no early stopping: held-out error is best before h holds the cue
     writer.close()
-    content = {"kind": "believer_belief", "config": config, "belief": model["belief"].state_dict()}
+    content = {**asdict(args), "config": config, "belief": model["belief"].state_dict()}
     save(path / "belief.pt", content)
     u, estimate = validate_belief(model["belief"], episodes, test_on)
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {r_squared(u[-1], estimate[-1]):.2f}")
@@ -772,9 +751,11 @@ def train_belief(args: Args, path: Path, episodes: EpisodeDataset, stored: dict)
 
 def evaluate_checkpoint(args: Args) -> None:
     """Evaluate the agent of --checkpoint, on test episodes; writes evaluation.json and .mp4 beside it."""
-    file = Path(args.checkpoint.format(**vars(args)))
-    stored = load(file, "name an agent.pt of this script with --checkpoint", kind="ppo_believer agent")
-    for name in ("env_id", "robot_triangles", "image_size", "num_envs", "amp", "num_particles", "sample_decoder"):
+    file = Path(args.checkpoint or f"runs/{args.env_id}__{args.exp_name}__{args.seed}/agent.pt")
+    stored = load(file, script="ppo_believer")
+    if not os.access(file.parent, os.W_OK):
+        fail(f"{file.parent} cannot be written, where evaluation.json and .mp4 would be; copy {file.name} elsewhere")
+    for name in ("env_id", "robot_triangles", "image_size", "num_envs", "amp", "num_particles"):
         setattr(args, name, stored[name])
     check_task(args)
     envs = make_envs(args)
@@ -796,23 +777,23 @@ def main(args: Args) -> None:
     num_iterations = max(1, args.total_timesteps // batch_size)
     if args.num_minibatches > batch_size:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {batch_size} steps of an iteration")
+    if max(args.gamma, args.gae_lambda) > 1:
+        fail(f"--gamma {args.gamma} and --gae-lambda {args.gae_lambda} must be at most 1")
     if args.total_timesteps > 1_000_000 and not CUDA:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes some 40 minutes", flush=True)
-    path = check_run(args)
-    resume = (path / "checkpoint.pt").exists() and not args.overwrite
-    checkpoint = load(path / "checkpoint.pt", "start again with --overwrite", kind="checkpoint") if resume else {}
+    path = open_run(args)
+    checkpoint = load(path / "checkpoint.pt") if (path / "checkpoint.pt").exists() else {}
+    if (path / "agent.pt").exists() and not checkpoint:
+        fail(f"{path} has results and no checkpoint.pt to go on from; choose another --exp-name")
     if checkpoint.get("iteration", 0) >= num_iterations:
-        print(f"{path} is finished; --overwrite recreates it, a larger --total-timesteps continues it")
+        print(f"{path} is finished; a larger --total-timesteps continues it")
         return
-    if (path / "belief.pt").exists() and not args.overwrite:
-        open_run(path, args)
-    else:
-        episodes, stored = load_episodes(args)
-        open_run(path, args)
-        train_belief(args, path, episodes, stored)
-        del episodes
+    task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size")}
+    file = Path(args.belief or path / "belief.pt")
+    if not args.belief and not file.exists():
+        train_belief(args, path)
         torch.cuda.empty_cache()  # the simulator needs the GPU's memory too
-    stored = load(path / "belief.pt", "start again with --overwrite", kind="believer_belief")
+    stored = load(file, **task)
 
     envs = make_envs(args)
     torch.manual_seed(args.seed)
@@ -824,7 +805,7 @@ def main(args: Args) -> None:
     completed, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
     reward_var = checkpoint.get("reward_var", 0.0)
     if checkpoint:
-        agent.load_state_dict(checkpoint["agent"])
+        agent.load_state_dict(checkpoint["agent"], strict=False)  # without the belief
         optimizer.load_state_dict(checkpoint["optimizer"])
         print(f"resuming {path} at step {completed * batch_size:,}", flush=True)
     writer = SummaryWriter(path, purge_step=completed * batch_size + 1)
@@ -882,15 +863,16 @@ def main(args: Args) -> None:
                 lines.append(",".join(map(str, row.values())))
             save(path / "eval.csv", ("\n".join(lines) + "\n").encode())
             save(path / "videos" / f"step_{global_step:08d}.mp4", video)
-            content = {"kind": "ppo_believer agent", **asdict(args), "config": stored["config"]}
+            content = {"script": "ppo_believer", **asdict(args), "config": stored["config"]}
             save(path / "agent.pt", {**content, "global_step": global_step, "agent": agent.state_dict()})
             bar.set_postfix(success_once=f"{metrics['success_once']:.2f}")
 
         for name, value in scalars.items():
             writer.add_scalar(name, value, global_step)
         writer.flush()
-        states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "reward_var": reward_var}
-        save(path / "checkpoint.pt", {"kind": "checkpoint", "iteration": iteration, "rows": evals, **states})
+        trained = {name: x for name, x in agent.state_dict().items() if not name.startswith("belief.")}
+        states = {"agent": trained, "optimizer": optimizer.state_dict(), "reward_var": reward_var}
+        save(path / "checkpoint.pt", {"iteration": iteration, "rows": evals, **states})
     envs.close()
     for name in ("success_once", "success_at_end", "return"):
         values = [row[name] for row in evals]
@@ -1037,7 +1019,13 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
 
 
 def check_task(args: Args) -> None:
-    """Fail on an unknown task, assets that are not on this machine, and where there is nothing to render with."""
+    """Fail on an unknown task, assets that are not on this machine, and where simulator or renderer do not start."""
+    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
+        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
+    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
+        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+    if args.image_size < 36:
+        fail(f"--image-size {args.image_size} must be at least 36, for the image network")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
     if args.env_id not in tasks:
         nearest = difflib.get_close_matches(args.env_id, tasks) or sorted(tasks)
@@ -1055,7 +1043,7 @@ def check_task(args: Args) -> None:
         fail(f"{args.render_backend} or {args.sim_backend} does not start ({error}); see docs/experiments.md")
 
 
-# ---------------------------------------------------------------- files and stages
+# ---------------------------------------------------------------- files
 # identical in all scripts that have them
 
 
@@ -1072,104 +1060,61 @@ def parse_args() -> Args:
     args = tyro.cli(Args, default=Args(env_id=chosen.env_id, **settings), description=__doc__.partition("Usage:")[0])
     if args.small and args.quick:
         fail("--small and --quick exclude each other; give one of them")
-    if set("/{}") & set(args.exp_name):
-        fail(f"--exp-name {args.exp_name} must be a folder's name, without / and braces")
+    if "/" in args.exp_name:
+        fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        flag = f"--{name.replace('_', '-')} {value}"
-        low, high = LIMITS.get(name, (1 if type(value) is int else 0, math.inf))
-        if isinstance(value, int | float) and not low <= value <= high:
-            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
-            fail(f"{flag} must be {bounds}")
-        try:
-            str(value).format(**vars(args))  # paths may contain {env_id} and {seed}
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-            fail(f"{flag} has braces around what is no argument's name; {{env_id}} and {{seed}} are")
-    if not CUDA and "cuda" in args.device + args.sim_backend + args.render_backend:
-        fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
-    if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
-        fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+        if isinstance(value, int | float) and not value >= 0:
+            fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
 
-def check_run(args: Args) -> Path:
-    """Path of the run, runs/{env_id}__{exp_name}__{seed}; fails when it was begun with other arguments."""
-    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
-    if (path / "args.json").exists() and not args.overwrite:
-        recorded, given, changed = json.loads((path / "args.json").read_text()), asdict(args), []
-        if not recorded:
-            fail(f"{path} is half deleted, by a run with --overwrite that was stopped; give --overwrite again")
-        for name in recorded | given:  # another script's run has others
-            if name not in MAY_DIFFER and recorded.get(name) != given.get(name):
-                changed.append(f"{name}={recorded.get(name)} there, {given.get(name)} here")
-        if changed:
-            fail(f"{path} was begun with other arguments ({'; '.join(changed)}); use --overwrite or another --exp-name")
-    return path
+def open_run(args: Args) -> Path:
+    """Make runs/{env_id}__{exp_name}__{seed} and lock it until this process ends.
 
-
-def open_run(path: Path, args: Args) -> None:
-    """Make the run's directory and lock it until this process ends; fails when another process holds the lock.
-
-    With --overwrite all that it holds is deleted, so call this only when all inputs have been read.
+    Fails when another process has the lock, or when the run was begun with other arguments.
     """
-    args_file = path / "args.json"
+    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
     try:
         path.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as the process lives
-        if args.overwrite:
-            save(args_file, b"{}")  # if the deletion is interrupted, check_run finds this and refuses to resume
-            for file in set(path.iterdir()) - {args_file}:
-                shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink()
-        save(args_file, json.dumps(asdict(args), indent=2).encode())
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
+    given, changed = asdict(args), []
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+        for name, value in json.loads((path / "args.json").read_text()).items():
+            if name in given and name not in MAY_DIFFER and value != given[name]:
+                changed.append(f"{name}={value} there, {given[name]} here")
+    if changed:
+        fail(
+            f"{path} was begun with other arguments ({'; '.join(changed)}); "
+            f"delete it with rm -r {path}, or choose another --exp-name"
+        )
+    save(path / "args.json", json.dumps(given, indent=2).encode())
+    return path
 
 
 def save(path: Path, content: dict | bytes) -> None:
     """Write a .pt file (dict) or plain bytes whole or not at all: to a temporary name, then renamed."""
-    path.parent.mkdir(exist_ok=True)
     part = path.with_name(path.name + ".part")
-    if isinstance(content, dict):
-        torch.save({"format": FORMAT, **content}, part)
-    else:
-        part.write_bytes(content)
-    os.replace(part, path)
+    try:
+        path.parent.mkdir(exist_ok=True)
+        torch.save(content, part) if isinstance(content, dict) else part.write_bytes(content)
+        os.replace(part, path)
+    except (OSError, RuntimeError) as error:  # torch.save says of a full disk: RuntimeError
+        part.unlink(missing_ok=True)
+        free = shutil.disk_usage(path.parent).free / 1e6
+        fail(f"{path} cannot be written ({error}; {free:.0f} MB are free); make room, and the same command goes on")
 
 
-def load(path: Path, hint: str, **expected: object) -> dict:
-    """Read a .pt file written by save; fails when it is missing, damaged or not as expected (kind, env_id, ...)."""
+def load(path: Path, **expected: object) -> dict:
+    """Read a .pt file that save wrote; fails where it is missing, or made for another task or picture (expected)."""
     if not path.exists():
         fail(f"{path} does not exist; run the script that writes it first, or correct the path")
-    expected = {"format": FORMAT, **expected}  # first, as another format explains all other differences
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        found = {name: content.get(name) for name in expected}
-    except Exception as error:  # torch, zipfile and pickle each say in their own way that bytes are wrong
-        fail(f"{path} is damaged or no file of these scripts ({type(error).__name__}); {hint}")
+    content = torch.load(path, map_location="cpu", weights_only=True)
     for name, value in expected.items():
-        if found[name] != value:
-            fail(f"{path} has {name} {found[name]}, this run needs {value}; {hint}")
+        if content.get(name) != value:
+            fail(f"{path} has {name} {content.get(name)}, this run needs {value}")
     return content
-
-
-def run_stage(script: str, args: Args) -> None:
-    """Run an earlier stage, whose output is missing, for the same task, seed, device, backends and sizes."""
-    command = [sys.executable, str(Path(__file__).with_name(script))]
-    if args.small:
-        command.append("--small")
-    if args.quick:
-        command.append("--quick")
-    task = ("env_id", "seed", "robot_triangles", "image_size", "num_episodes")
-    for name in (*task, "device", "sim_backend", "render_backend", "num_workers"):
-        command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
-    print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
-    # prctl(PR_SET_PDEATHSIG, SIGKILL): the stage ends when this process is killed
-    stage = subprocess.Popen(command, preexec_fn=lambda: ctypes.CDLL(None).prctl(1, signal.SIGKILL))
-    try:
-        stage.wait()
-    except KeyboardInterrupt:
-        sys.exit(stage.wait() or 1)  # Ctrl-C has reached the stage, too, and the stage has said so
-    if stage.returncode:
-        sys.exit(stage.returncode)
 
 
 if __name__ == "__main__":
@@ -1180,4 +1125,4 @@ if __name__ == "__main__":
         else:
             main(args)
     except KeyboardInterrupt:
-        sys.exit("\nstopped; the same command, without --overwrite, resumes a run from what was saved last")
+        sys.exit("\nstopped; the same command resumes the run from what was saved last")

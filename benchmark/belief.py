@@ -25,19 +25,18 @@ import ppo_believer  # noqa: E402
 
 def main(args: ppo_believer.Args) -> None:
     """Train Believer's belief, write its diagnostics.json, print the table."""
-    path = ppo_believer.check_run(args)
+    path = ppo_believer.open_run(args)
     episodes, stored = ppo_believer.load_episodes(args)
-    ppo_believer.open_run(path, args)
     if not (path / "belief.pt").exists():
-        ppo_believer.train_belief(args, path, episodes, stored)
-    belief = ppo_believer.BelieverBelief(ppo_believer.load(path / "belief.pt", "")["config"])
+        ppo_believer.train_belief(args, path)
+    belief = ppo_believer.BelieverBelief(ppo_believer.load(path / "belief.pt")["config"])
     belief.prior = lambda h: Normal(h.new_zeros(*h.shape[:-1], args.z_dim), 1.0)
     posterior = ppo_believer.GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     model = torch.nn.ModuleDict({"belief": belief, "posterior": posterior})
     model["teacher"], model["locator"] = ppo_believer.Teacher(stored["u_dim"]), ppo_believer.Locator(stored["u_dim"])
-    model.load_state_dict(ppo_believer.load(path / "belief_checkpoint.pt", "")["model"])
+    model.load_state_dict(ppo_believer.load(path / "belief_checkpoint.pt")["model"])
     model.to(args.device)
-    held_out = np.arange(args.num_episodes)[-stored["num_val"] :]
+    held_out = np.arange(len(episodes))[-stored["num_val"] :]
     fit_on, test_on = np.split(held_out, [len(held_out) - len(held_out) // 2])  # as in aib_belief.main
     fit, test = (aib_belief.encode(belief, posterior, episodes, index) for index in (fit_on, test_on))
     ppo_believer.save(path / "diagnostics.json", json.dumps(aib_belief.probe_belief(fit, test), indent=2).encode())

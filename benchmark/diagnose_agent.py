@@ -58,8 +58,8 @@ def nearest_and_success(buffer: dict[str, Tensor]) -> dict[str, float]:
 
 def main(args: Args) -> None:
     """Evaluate the agent with other metrics."""
-    kind = ppo_baseline.load(args.checkpoint, "name an agent.pt with --checkpoint")["kind"]
-    scripts = {f"{script.__name__} agent": script for script in (ppo_aib, ppo_believer, ppo_baseline)}
+    kind = ppo_baseline.load(args.checkpoint).get("script")
+    scripts = {script.__name__: script for script in (ppo_aib, ppo_believer, ppo_baseline)}
     if kind not in scripts:
         ppo_baseline.fail(f"{args.checkpoint} is no agent; name an agent.pt with --checkpoint")
     script = scripts[kind]

@@ -5,7 +5,8 @@ sees u with --phi, what a belief is trained to know, or with --target the target
 --pictures it sees the picture, too, as AIB's policy does: what pictures cost PPO.
 
 Usage:   python benchmark/true_state.py --env-id RememberColor5-v0 --small
-         python benchmark/true_state.py --env-id RememberColor5-v0 --small --phi 'runs/{env_id}__aib_repr_small__{seed}'
+         python benchmark/true_state.py --env-id RememberColor5-v0 --small \\
+             --phi runs/RememberColor5-v0__aib_repr_small__1
          python benchmark/true_state.py --env-id RememberColor5-v0 --small --target
 Takes:   the arguments of ppo_baseline.py; always simulates on the CPU
 Writes:  runs/{env_id}__true_state__{seed}/ (true_u, true_target; …_pictures; …_small), as ppo_baseline.py; empty videos
@@ -107,8 +108,8 @@ class StateAgent(nn.Module):
 
 def load_phi(args: Args) -> StateEncoder:
     """Stage 1's state encoder from args.phi, frozen."""
-    path = Path(args.phi.format(**vars(args))) / "repr.pt"
-    stored = ppo_baseline.load(path, "name a run of aib_repr.py with --phi", env_id=args.env_id, kind="repr")
+    path = Path(args.phi) / "repr.pt"
+    stored = ppo_baseline.load(path, env_id=args.env_id)
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
     return phi.requires_grad_(False)

@@ -56,8 +56,8 @@ def toy_stages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         toy.take_the_simulators_place(patch.setattr, aib_repr)
-        aib_repr.main(aib_repr.Args(env_id=TOY, num_episodes=20, val_fraction=0.25, epochs=1, batch_size=50))
-        aib_belief.main(aib_belief.Args(env_id=TOY, num_episodes=20, num_updates=3, batch_episodes=4))
+        aib_repr.main(aib_repr.Args(env_id=TOY, num_episodes=20, epochs=1, batch_size=50))
+        aib_belief.main(aib_belief.Args(env_id=TOY, num_updates=3, batch_episodes=4))
     return folder / "runs"
 
 

@@ -14,16 +14,14 @@ ROOT = Path(__file__).parent.parent
 PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num_workers=3)
 PPO |= dict(joints_norm=True, reward_norm=True)
 SIZES = {
-    "aib_repr": dict(num_episodes=12, val_fraction=0.34, epochs=3, batch_size=30, num_workers=2),
-    "aib_belief": dict(num_episodes=12, warmup_updates=2, num_updates=4, batch_episodes=4, val_every=2, prior_nll=1.0),
-    "ppo_aib": dict(num_episodes=12, total_timesteps=240, **PPO),
+    "aib_repr": dict(num_episodes=12, epochs=3, batch_size=30, num_workers=2),
+    "aib_belief": dict(warmup_updates=2, num_updates=4, batch_episodes=4, prior_nll=1.0),
+    "ppo_aib": dict(total_timesteps=240, **PPO),
     "ppo_believer": dict(
-        num_episodes=12,
         total_timesteps=160,
         warmup_updates=2,
         num_updates=2,
         batch_episodes=4,
-        val_every=2,
         **PPO,
     ),
     "ppo_baseline": dict(total_timesteps=240, **PPO),

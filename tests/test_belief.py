@@ -31,9 +31,9 @@ def make_stage_1(folder: Path, episodes: int) -> int:
     arrays |= {"actions": rng.uniform(-1, 1, (episodes, 10, 2)), "cue": rng.integers(3, size=(episodes, 1))}
     for name, array in arrays.items():
         np.save(path / "dataset" / f"{name}.npy", array.astype(np.float32))
-    content = {"kind": "repr", "env_id": TOY, "robot_triangles": 500, "image_size": 128, "num_val": 8}
+    content = {"env_id": TOY, "robot_triangles": 500, "image_size": 128, "num_val": 8}
     phi, psi = aib_repr.StateEncoder(4, 4), aib_repr.ObservationEncoder([128, 128, 3], 3, 4)
-    content |= {"num_episodes": episodes, "u_dim": 4, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())}
+    content |= {"u_dim": 4, "phi": phi.state_dict(), "norm": dict(psi.named_buffers())}
     aib_repr.save(path / "repr.pt", content)
     return rgb.nbytes
 
@@ -43,8 +43,7 @@ def test_peak_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path) -
     for episodes in (560, 1600):
         folder = tmp_path / str(episodes)
         sizes.append(make_stage_1(folder, episodes))
-        sizes_of_run = f"num_episodes={episodes}, num_updates=3, batch_episodes=4"
-        code = f"import sys, aib_belief as b; b.main(b.Args(env_id=sys.argv[1], {sizes_of_run}))"
+        code = "import sys, aib_belief as b; b.main(b.Args(env_id=sys.argv[1], num_updates=3, batch_episodes=4))"
         # not ru_maxrss: a child inherits its parent's
         code += "; print('PEAK', open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"
         env = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -67,11 +66,12 @@ def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_
         return encoded[-1]
 
     monkeypatch.setattr(aib_belief, "encode", recorded)
+    monkeypatch.setattr(aib_belief, "VAL_EVERY", 2)
     repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
-    path = train(aib_belief, repr_dir=repr_dir, num_episodes=20, num_updates=6, batch_episodes=4, val_every=2)
-    fit, test = [15, 16, 17], [18, 19]  # of 20 episodes, a quarter of which is held out
+    path = train(aib_belief, repr_dir=repr_dir, num_updates=6, batch_episodes=4)
+    fit, test = [16, 17], [18, 19]  # of 20 episodes, the last four of which are held out
     trained = [index for index in read if len(index) == 4]
-    assert len(trained) == 6 and max(map(max, trained)) < 15
+    assert len(trained) == 6 and max(map(max, trained)) < 16
     assert [episodes for episodes, _ in looks] == [test] * 3 + [fit, test]
     stored = torch.load(path / "belief.pt", weights_only=True)
     phi = torch.load(Path(repr_dir) / "repr.pt", weights_only=True)["phi"]
@@ -99,9 +99,9 @@ def test_believers_belief_gets_the_episodes_phi_and_statistics_of_aibs(
 ) -> None:
     read, repr_dir = note_episodes(monkeypatch, ppo_believer), toy_stages / f"{TOY}__aib_repr__1"
     sizes = dict(num_updates=3, batch_episodes=4, num_envs=4, total_timesteps=40, num_minibatches=2)
-    path = train(ppo_believer, repr_dir=str(repr_dir), num_episodes=20, num_eval_episodes=2, **sizes)
+    path = train(ppo_believer, repr_dir=str(repr_dir), num_eval_episodes=2, **sizes)
     trained = [index for index in read if len(index) == 4]
-    assert len(trained) == 3 and max(map(max, trained)) < 15
+    assert len(trained) == 3 and max(map(max, trained)) < 16
     assert [index for index in read if len(index) == 2] == [[18, 19]] * 2
     belief = torch.load(path / "belief.pt", weights_only=True)["belief"]
     stage_1 = torch.load(repr_dir / "repr.pt", weights_only=True)
@@ -129,7 +129,7 @@ def test_warm_up_then_the_teacher_acts_then_the_memory(
 
     monkeypatch.setattr(module, "warmup_losses", noted_warmup)
     monkeypatch.setattr(module, "encode_history", noted_history)
-    sizes = dict(num_episodes=20, warmup_updates=2, num_updates=4, batch_episodes=4, belief_lr=1e-3)
+    sizes = dict(warmup_updates=2, num_updates=4, batch_episodes=4, belief_lr=1e-3)
     if script == "ppo_believer":
         sizes |= dict(num_envs=4, total_timesteps=40, num_minibatches=2, num_eval_episodes=2)
     train(module, repr_dir=str(toy_stages / f"{TOY}__aib_repr__1"), **sizes)
@@ -146,20 +146,29 @@ def test_warm_up_then_the_teacher_acts_then_the_memory(
 )
 def test_ablations_train(toy_task: Path, toy_stages: Path, variant: dict) -> None:
     repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
-    path = train(aib_belief, repr_dir=repr_dir, num_episodes=20, num_updates=1, batch_episodes=4, **variant)
+    path = train(aib_belief, repr_dir=repr_dir, num_updates=1, batch_episodes=4, **variant)
     report = json.loads((path / "diagnostics.json").read_text())
     assert len(report["u_r2_prior"]) == 11 and "flow_gain" not in report
 
 
-def test_an_earlier_stage_gets_what_it_needs_to_know(monkeypatch: pytest.MonkeyPatch) -> None:
-    commands = []
-    stage = SimpleNamespace(wait=lambda: 0, returncode=0)
-    monkeypatch.setattr(subprocess, "Popen", lambda command, **_: commands.append(command) or stage)
-    same = dict(env_id="RememberColor3-v0", seed=3, small=True, robot_triangles=0, image_size=40, num_workers=5)
-    for module, script in ((aib_belief, "aib_repr.py"), (ppo_aib, "aib_belief.py"), (ppo_believer, "aib_repr.py")):
-        module.run_stage(script, module.Args(num_episodes=77, **same))
-        earlier = {"aib_repr.py": aib_repr, "aib_belief.py": aib_belief}[script]
-        monkeypatch.setattr(sys, "argv", commands[-1][1:])
-        args = earlier.parse_args()
-        assert {**same, "num_episodes": 77}.items() <= asdict(args).items()
-        assert args.exp_name == f"{script.removesuffix('.py')}_small"
+def test_earlier_stages_get_what_they_need_to_know(
+    toy_task: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    commands, status = [], 0
+    monkeypatch.setattr(subprocess, "run", lambda x: commands.append(x) or SimpleNamespace(returncode=status))
+    same = dict(env_id="RememberColor3-v0", seed=3, small=True)
+    simulator = dict(robot_triangles=0, image_size=40, num_workers=5)
+    for module, scripts in ((ppo_aib, (aib_repr, aib_belief)),):
+        with pytest.raises(SystemExit):  # as the command, which does nothing here, leaves no file
+            module.main(module.Args(**same, **simulator, exp_name="test", num_minibatches=1))
+        for earlier in scripts:
+            monkeypatch.setattr(sys, "argv", commands.pop(0)[1:])
+            args = earlier.parse_args()
+            expected = same if earlier is aib_belief else same | simulator
+            assert expected.items() <= asdict(args).items() and args.exp_name == f"{earlier.__name__}_small"
+    assert not commands
+    capsys.readouterr()
+    status = -9
+    with pytest.raises(SystemExit):
+        ppo_aib.run_stage("aib_repr.py", ppo_aib.Args(), [])
+    assert "aib_repr.py was killed by signal 9" in capsys.readouterr().err

@@ -27,7 +27,7 @@ def disc_pixels(rgb: np.ndarray) -> np.ndarray:
 
 def run_example(name: str, task: str, folder: Path) -> dict[str, np.ndarray]:
     """Run docs/examples/{name}.py from nothing; the random episodes that stage 1 collected."""
-    code, out, err = run(f"docs/examples/{name}", "--quick", "--num-workers", "2", cwd=folder)
+    code, out, err = run(f"docs/examples/{name}", "--quick", cwd=folder)
     assert code == 0, out + err
     trained = folder / "runs" / f"{task}__ppo_aib_quick__1"
     assert (trained / "agent.pt").exists()

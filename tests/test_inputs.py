@@ -59,9 +59,12 @@ def test_physx_without_its_library(capsys: pytest.CaptureFixture, monkeypatch: p
     def enable_gpu() -> None:
         raise OSError("libcuda.so: cannot open shared object file")
 
+    monkeypatch.setattr(aib_repr, "CUDA", True)
+    monkeypatch.setattr(aib_repr.sapien.render, "RenderSystem", lambda _: None)
+    monkeypatch.setattr(aib_repr.sapien, "Device", str)
     monkeypatch.setattr(aib_repr.sapien.physx, "enable_gpu", enable_gpu)
     with pytest.raises(SystemExit) as stop:
-        aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", robot_triangles=0))
+        aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", render_backend="sapien_cuda", robot_triangles=0))
     refused((stop.value.code, *capsys.readouterr()), "physx_cuda does not start", "libcuda.so", "docs/experiments.md")
 
 
@@ -73,19 +76,21 @@ def test_physx_is_downloaded_by_one_process_at_a_time(monkeypatch: pytest.Monkey
 
     started = []
     monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(aib_repr, "CUDA", True)
+    monkeypatch.setattr(aib_repr.sapien.render, "RenderSystem", lambda _: None)
+    monkeypatch.setattr(aib_repr.sapien, "Device", str)
     monkeypatch.setattr(aib_repr.sapien.physx, "enable_gpu", enable_gpu)
-    aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", robot_triangles=0))
+    aib_repr.check_task(aib_repr.Args(sim_backend="physx_cuda", render_backend="sapien_cuda", robot_triangles=0))
     assert started
 
 
 def test_the_gpus_physics_with_the_cpus_pictures(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    for module in SCRIPTS.values():
+    for module in (aib_repr, ppo_aib, ppo_believer, ppo_baseline):
         monkeypatch.setattr(module, "CUDA", True)
-        monkeypatch.setattr(sys, "argv", ["script", "--sim-backend", "physx_cuda", "--render-backend", "sapien_cpu"])
         with pytest.raises(SystemExit) as stop:
-            module.parse_args()
+            module.check_task(module.Args(sim_backend="physx_cuda", render_backend="sapien_cpu"))
         refused((stop.value.code, *capsys.readouterr()), "physx_cuda needs --render-backend sapien_cuda")
 
 
@@ -97,36 +102,15 @@ def test_a_folder_that_cannot_be_written() -> None:
 @pytest.mark.parametrize(
     "script, arguments, words",
     [
-        ("aib_repr", ["--num-episodes", "0"], ["--num-episodes 0", "at least 1"]),
-        ("aib_belief", ["--belief-lr", "-1"], ["--belief-lr -1.0", "at least 0"]),
+        ("aib_repr", ["--num-episodes", "-1"], ["--num-episodes -1 must not be negative"]),
+        ("aib_belief", ["--belief-lr", "-1"], ["--belief-lr -1.0 must not be negative"]),
         ("ppo_aib", ["--learning-rate", "nan"], ["--learning-rate nan"]),
-        ("ppo_believer", ["--eval-every", "0"], ["--eval-every 0"]),
         ("ppo_baseline", ["--seed", "-1"], ["--seed -1"]),
-        ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
-        ("ppo_baseline", ["--init-std", "0"], ["--init-std 0.0", "at least 0.001"]),
-        ("ppo_baseline", ["--noise-beta", "-0.1"], ["--noise-beta -0.1", "between 0 and 2"]),
-        ("ppo_baseline", ["--num-eval-episodes", "1"], ["--num-eval-episodes 1 must be at least 2"]),
-        ("ppo_aib", ["--noise-beta", "2.5"], ["--noise-beta 2.5", "between 0 and 2"]),
-        ("ppo_believer", ["--noise-beta", "nan"], ["--noise-beta nan"]),
-        ("ppo_baseline", ["--gamma", "1.5"], ["--gamma 1.5", "between 0 and 1"]),
         ("ppo_aib", ["--small", "--quick"], ["--small and --quick exclude each other"]),
         ("ppo_baseline", ["--exp-name", "a/b"], ["--exp-name a/b", "without /"]),
-        ("ppo_aib", ["--image-size", "32"], ["--image-size 32", "at least 36"]),
-        ("aib_belief", ["--image-mask", "1.5"], ["--image-mask 1.5", "between 0 and 1"]),
-        ("aib_repr", ["--val-fraction", "1.5"], ["--val-fraction 1.5", "between 0 and 1"]),
-        ("ppo_believer", ["--num-minibatches", "0"], ["--num-minibatches 0", "at least 1"]),
-        (
-            "ppo_aib",
-            ["--belief", "runs/{env}__aib_belief__1/belief.pt"],
-            ["--belief runs/{env}__", "{env_id} and {seed}"],
-        ),
-        ("ppo_aib", ["--exp-name", "{seed}"], ["--exp-name {seed}", "without / and braces"]),
-        ("aib_belief", ["--repr-dir", "runs/{"], ["--repr-dir runs/{ has braces"]),
-        ("ppo_aib", ["--belief", "{seed.x}"], ["--belief {seed.x} has braces"]),
-        ("ppo_baseline", ["--device", "cuda"], ["no CUDA device", "--device cpu"]),
     ],
 )
-def test_numbers_and_devices(
+def test_numbers(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture,
     script: str,
@@ -139,10 +123,23 @@ def test_numbers_and_devices(
     refused((stop.value.code, *capsys.readouterr()), *words)
 
 
-def test_more_minibatches_than_steps(toy_task: Path, capsys: pytest.CaptureFixture) -> None:
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (dict(num_minibatches=21), ["--num-minibatches 21", "at most the 20 steps"]),
+        (dict(gamma=1.5, num_minibatches=2), ["--gamma 1.5", "at most 1"]),
+        (dict(image_size=32), ["--image-size 32", "at least 36"]),
+        (dict(device="cuda"), ["no CUDA device", "--device cpu"]),
+    ],
+)
+def test_what_would_fail_late(
+    toy_task: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, wrong: dict, words: list[str]
+) -> None:
+    if wrong.keys() & {"image_size", "device"}:
+        monkeypatch.setattr(ppo_baseline, "check_task", CHECK_TASK)
     with pytest.raises(SystemExit) as stop:
-        train(ppo_baseline, num_envs=2, num_minibatches=21)
-    refused((stop.value.code, *capsys.readouterr()), "--num-minibatches 21", "at most the 20 steps")
+        train(ppo_baseline, num_envs=2, **wrong)
+    refused((stop.value.code, *capsys.readouterr()), *words)
     assert not list(toy_task.iterdir())
 
 
@@ -190,47 +187,36 @@ def rewrite_args(**values: object) -> Callable[[], object]:
     return lambda: file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
 
 
-STAGE_1 = dict(num_episodes=20, val_fraction=0.25, epochs=1, batch_size=50)
+STAGE_1 = dict(num_episodes=20, epochs=1, batch_size=50)
 STAGE_2 = dict(exp_name="again", num_updates=1)
 PPO = dict(num_envs=4, total_timesteps=40, num_eval_episodes=4, num_minibatches=2)
 ONLY_EVALUATE = dict(evaluate=True, num_envs=4, num_eval_episodes=4, checkpoint=str(AGENT))
 CASES = {  # name: (script, arguments, damage, words of the sentence)
-    "nothing held out": (aib_repr, dict(val_fraction=0.0), None, ["--val-fraction 0.0", "--num-episodes"]),
-    "all held out": (aib_repr, dict(val_fraction=1.0), None, ["--val-fraction 1.0"]),
-    "dataset of another format": (aib_repr, STAGE_1, other_dataset(format=9), ["has format 9", "--overwrite"]),
     "dataset of more episodes": (aib_repr, STAGE_1, other_dataset(num_episodes=30), ["has num_episodes 30"]),
-    "repr.pt cut short": (aib_belief, STAGE_2, cut(REPR_PT), ["repr.pt is damaged", "--overwrite"]),
     "repr.pt of another task": (aib_belief, STAGE_2, change(REPR_PT, env_id="X-v0"), ["has env_id X-v0"]),
-    "repr.pt of fewer episodes": (
+    "named repr_dir missing": (
         aib_belief,
-        {**STAGE_2, "num_episodes": 30},
+        {**STAGE_2, "repr_dir": "no"},
         None,
-        ["has num_episodes 20"],
+        ["no/repr.pt does not exist", "aib_repr.py --env-id"],
     ),
-    "belief.pt of fewer episodes": (ppo_aib, {**PPO, "num_episodes": 30}, None, ["belief.pt has num_episodes 20"]),
-    "repr.pt of other meshes": (aib_belief, STAGE_2, change(REPR_PT, robot_triangles=0), ["has robot_triangles 0"]),
-    "repr.pt of other pictures": (aib_belief, STAGE_2, change(REPR_PT, image_size=64), ["has image_size 64"]),
-    "named repr_dir missing": (aib_belief, {**STAGE_2, "repr_dir": "no"}, None, ["no/repr.pt does not exist"]),
-    "images cut short": (aib_belief, STAGE_2, cut(DATA / "rgb.npy"), ["dataset is damaged", "--overwrite"]),
-    "an array missing": (aib_belief, STAGE_2, (DATA / "cue.npy").unlink, ["dataset is damaged", "cue.npy"]),
-    "an array is a text": (aib_belief, STAGE_2, write(DATA / "state.npy", b"hello"), ["dataset is damaged"]),
-    "belief.pt cut short": (ppo_aib, PPO, cut(BELIEF_PT), ["belief.pt is damaged", "aib_belief.py"]),
-    "belief.pt is repr.pt": (ppo_aib, {**PPO, "belief": str(REPR_PT)}, None, ["has kind repr", "needs aib_belief"]),
-    "belief.pt of Believer": (ppo_aib, PPO, change(BELIEF_PT, kind="believer_belief"), ["has kind believer_belief"]),
     "belief.pt of another task": (ppo_aib, PPO, change(BELIEF_PT, env_id="X-v0"), ["has env_id X-v0"]),
     "named belief missing": (ppo_aib, {**PPO, "belief": "no.pt"}, None, ["no.pt does not exist"]),
-    "Believer on a damaged repr.pt": (ppo_believer, PPO, cut(REPR_PT), ["repr.pt is damaged"]),
+    "belief.pt of other meshes": (ppo_aib, PPO, change(BELIEF_PT, robot_triangles=0), ["has robot_triangles 0"]),
+    "belief.pt of other pictures": (
+        ppo_believer,
+        {**PPO, "belief": str(BELIEF_PT), "image_size": 64},
+        None,
+        ["has image_size"],
+    ),
     "agent.pt missing": (ppo_baseline, {**ONLY_EVALUATE, "checkpoint": "no.pt"}, None, ["no.pt does not exist"]),
-    "agent.pt of another script": (ppo_aib, ONLY_EVALUATE, None, ["ppo_baseline agent", "needs ppo_aib agent"]),
-    "agent.pt cut short": (ppo_baseline, ONLY_EVALUATE, cut(AGENT), ["agent.pt is damaged"]),
-    "checkpoint.pt cut short": (ppo_baseline, PPO, cut(CHECKPOINT), ["checkpoint.pt is damaged"]),
-    "other arguments": (ppo_baseline, {**PPO, "gamma": 0.5}, None, ["gamma=0.99 there, 0.5 here", "--exp-name"]),
-    "run of another script": (ppo_baseline, PPO, rewrite_args(belief="x.pt"), ["belief=x.pt there, None here"]),
-    "killed while it was deleted": (
+    "agent.pt of another script": (ppo_aib, ONLY_EVALUATE, None, ["has script ppo_baseline", "needs ppo_aib"]),
+    "results without a checkpoint": (ppo_baseline, PPO, CHECKPOINT.unlink, ["has results and no checkpoint.pt"]),
+    "other arguments": (
         ppo_baseline,
-        PPO,
-        write(AGENT.with_name("args.json"), b"{}"),
-        ["is half deleted", "--overwrite"],
+        {**PPO, "gamma": 0.5},
+        None,
+        ["gamma=0.99 there, 0.5 here", "rm -r"],
     ),
     "runs is a file": (
         ppo_baseline,
@@ -272,38 +258,21 @@ def test_bad_files_and_arguments(folder: Path, capfd: pytest.CaptureFixture, nam
     if damage:
         damage()
     before = snapshot(folder)
-    sizes = {} if module is ppo_baseline else {"num_episodes": 20}
     capfd.readouterr()
     with pytest.raises(SystemExit) as stop:
-        train(module, **{**sizes, **arguments})
+        train(module, **arguments)
     out, err = capfd.readouterr()
     refused((stop.value.code, out, err), *words)
     after = snapshot(folder)
     assert {path: after.get(path) for path in before} == before, "nothing is overwritten"
 
 
-@pytest.mark.parametrize(
-    "content, words",
-    [
-        (b"", ["is damaged"]),
-        (b"hello", ["is damaged"]),
-        (pickle.dumps(Payload()), ["is damaged"]),
-        ({"format": ppo_baseline.FORMAT, "kind": "x", "code": Payload()}, ["is damaged"]),
-        ({"format": 99, "kind": "y"}, ["has format 99"]),
-        ({"format": ppo_baseline.FORMAT, "kind": "y"}, ["has kind y, this run needs x"]),
-        ([1, 2], ["is damaged"]),
-    ],
-)
-def test_what_load_refuses(tmp_path: Path, capsys: pytest.CaptureFixture, content: object, words: list[str]) -> None:
-    file = tmp_path / "file.pt"
-    if isinstance(content, bytes):
-        file.write_bytes(content)
-    else:
-        torch.save(content, file)
-    with pytest.raises(SystemExit) as stop:
-        ppo_baseline.load(file, "recreate it", kind="x")
-    refused((stop.value.code, *capsys.readouterr()), "file.pt", "recreate it", *words)
-    assert not Path("executed").exists(), "no code of a file runs"
+def test_no_code_of_a_file_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.save({"env_id": TOY, "code": Payload()}, "file.pt")
+    with pytest.raises(pickle.UnpicklingError):
+        ppo_baseline.load(Path("file.pt"))
+    assert not Path("executed").exists()
 
 
 def test_a_second_process_is_refused(toy_task: Path, capfd: pytest.CaptureFixture) -> None:
@@ -316,87 +285,39 @@ def test_a_second_process_is_refused(toy_task: Path, capfd: pytest.CaptureFixtur
     refused((stop.value.code, *capfd.readouterr()), "is another process's")
 
 
-def test_a_run_does_not_go_on_with_another_input(folder: Path, capfd: pytest.CaptureFixture) -> None:
-    """Stopped runs whose earlier stage was made anew in the meantime."""
-    train(ppo_aib, **PPO, num_episodes=20)
-    change(Path(f"runs/{TOY}__ppo_aib__1/checkpoint.pt"), iteration=0)()
-    weights = torch.load(BELIEF_PT, weights_only=True)["belief"]
-    retrained = {name: 1.01 * x for name, x in weights.items()}
-    for other in (retrained, weights | {"history.gru.bias": torch.zeros(768)}):  # another GRU
-        change(BELIEF_PT, belief=other)()
-        with pytest.raises(SystemExit) as stop:
-            train(ppo_aib, **PPO, num_episodes=20)
-        refused((stop.value.code, *capfd.readouterr()), "began with another belief", "--overwrite")
-    BELIEF_PT.unlink()
-    with pytest.raises(SystemExit) as stop:
-        train(ppo_aib, **PPO, num_episodes=20)
-    refused((stop.value.code, *capfd.readouterr()), "belief.pt does not exist")
-    change(REPR_PT, seed=2)()
-    with pytest.raises(SystemExit) as stop:
-        train(aib_belief, num_episodes=20, num_updates=3, batch_episodes=4)
-    refused((stop.value.code, *capfd.readouterr()), "has repr_crc", "--overwrite")
-
-
 @pytest.mark.parametrize(
     "script, wrong, words",
     [
-        ("aib_repr", dict(val_fraction=0.0), ["--val-fraction 0.0"]),
-        ("aib_repr", dict(num_episodes=10**10), ["more than the disk has", "--num-episodes"]),
         ("aib_belief", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
         ("ppo_aib", dict(belief="nope.pt"), ["nope.pt does not exist"]),
         ("ppo_believer", dict(repr_dir="nope"), ["nope/repr.pt does not exist"]),
-        ("aib_belief", dict(small=True), ["__aib_repr__1/repr.pt does not exist"]),  # --small makes aib_repr_small
-        ("ppo_aib", dict(small=True), ["__aib_belief__1/belief.pt does not exist"]),
-        ("ppo_baseline", dict(env_id="ToyMemoryy-v0"), ["ToyMemoryy-v0 is no task"]),
+        ("aib_belief", dict(quick=True), ["__aib_repr_quick__1/repr.pt", "--seed 1 --quick"]),
     ],
 )
-def test_overwrite_deletes_nothing_before_the_inputs_are_read(
-    toy_task: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture,
-    script: str,
-    wrong: dict,
-    words: list[str],
+def test_a_command_can_be_corrected(
+    toy_task: Path, capfd: pytest.CaptureFixture, script: str, wrong: dict, words: list[str]
 ) -> None:
-    module = SCRIPTS[script]
-    if script == "ppo_baseline":
-        monkeypatch.setattr(module, "check_task", CHECK_TASK)
-    args = module.Args(**{"env_id": TOY, **wrong}, overwrite=True)
-    path = Path("runs") / f"{args.env_id}__{args.exp_name}__{args.seed}"
-    for existing in (False, True):
-        if existing:
-            path.mkdir(parents=True)
-            (path / "agent.pt").write_bytes(b"days of work")
-        with pytest.raises(SystemExit) as stop:
-            module.main(args)
-        refused((stop.value.code, *capfd.readouterr()), *words)
-        assert (path / "agent.pt").exists() if existing else not Path("runs").exists()
+    with pytest.raises(SystemExit) as stop:
+        train(SCRIPTS[script], **wrong)
+    refused((stop.value.code, *capfd.readouterr()), *words)
+    left = {path.name for path in toy_task.rglob("*") if path.is_file()}
+    assert left <= {"args.json"}, "which alone does not bind the next run to its arguments"
 
 
-def test_overwrite_starts_again(folder: Path) -> None:
-    leftover = AGENT.parent / "videos" / "old.mp4"
-    leftover.write_text("old")
-    elsewhere = folder / "elsewhere"
-    elsewhere.mkdir()
-    AGENT.with_name("linked").symlink_to(elsewhere)
-    train(ppo_baseline, **{**PPO, "gamma": 0.5, "overwrite": True})
-    assert not leftover.exists() and not AGENT.with_name("linked").exists() and elsewhere.exists()
-    assert json.loads((AGENT.parent / "args.json").read_text())["gamma"] == 0.5
-
-
-def test_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A write that breaks off, as on a full disk, leaves the old file whole."""
     file = tmp_path / "x.pt"
-    ppo_baseline.save(file, {"kind": "x", "value": 1})
+    ppo_baseline.save(file, {"value": 1})
 
     def full_disk(content: dict, path: Path) -> None:
         path.write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full_disk)
-    with pytest.raises(OSError):
-        ppo_baseline.save(file, {"kind": "x", "value": 2})
-    assert ppo_baseline.load(file, "", kind="x")["value"] == 1
+    with pytest.raises(SystemExit) as stop:
+        ppo_baseline.save(file, {"value": 2})
+    refused((stop.value.code, *capsys.readouterr()), "x.pt cannot be written", "No space left", "MB are free")
+    assert ppo_baseline.load(file)["value"] == 1 and list(tmp_path.iterdir()) == [file]
 
 
 def test_a_loss_that_is_not_finite_ends_the_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -410,7 +331,7 @@ def test_a_loss_that_is_not_finite_ends_the_run(folder: Path, monkeypatch: pytes
 
     monkeypatch.setattr(ppo_baseline, "ppo_losses", poisoned)
     with pytest.raises(RuntimeError, match="non-finite"):
-        train(ppo_baseline, **{**PPO, "total_timesteps": 120, "overwrite": True, "target_kl": 1e9})
-    checkpoint = torch.load(CHECKPOINT, weights_only=True)
+        train(ppo_baseline, **{**PPO, "exp_name": "poisoned", "total_timesteps": 120, "target_kl": 1e9})
+    checkpoint = torch.load(f"runs/{TOY}__poisoned__1/checkpoint.pt", weights_only=True)
     assert checkpoint["iteration"] == 1
     assert all(np.isfinite(value).all() for value in checkpoint["agent"].values())

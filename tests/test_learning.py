@@ -12,7 +12,7 @@ import aib_repr
 from conftest import SCRIPTS, train
 
 REPR = dict(num_episodes=300, epochs=12, batch_size=100, learning_rate=1e-3, psi_images=False, num_workers=100)
-BELIEF = dict(num_episodes=300, num_updates=150, batch_episodes=24, belief_lr=1e-3, val_every=50)
+BELIEF = dict(num_updates=150, batch_episodes=24, belief_lr=1e-3)
 PPO = dict(total_timesteps=64 * 10 * 12, num_envs=64, learning_rate=1e-3, num_minibatches=8, update_epochs=4)
 PPO |= dict(eval_every=5, num_eval_episodes=192, ent_coef=0.0, num_workers=64)
 
@@ -24,7 +24,7 @@ def test_belief_solves_what_plain_ppo_cannot(toy_task: Path, seed: int) -> None:
     assert belief["cue_from_particle"][-1] > 0.95
     success = {}
     for name in ("ppo_aib", "ppo_believer", "ppo_baseline"):
-        more = {"ppo_aib": dict(num_episodes=300), "ppo_believer": BELIEF, "ppo_baseline": {}}[name]
+        more = {"ppo_aib": {}, "ppo_believer": BELIEF, "ppo_baseline": {}}[name]
         path = train(SCRIPTS[name], seed=seed, **PPO, **more)
         rows = list(csv.DictReader((path / "eval.csv").open()))
         success[name] = np.mean([float(row["success_once"]) for row in rows[-3:]])

@@ -51,7 +51,7 @@ def losses_args(**changes: object) -> SimpleNamespace:
     return SimpleNamespace(**{**defaults, **changes})
 
 
-REPR_ARGS = SimpleNamespace(reward_coef=10.0, state_coef=0.3, obs_coef=0.03, kl_coef=0.01, kl_reduction="sum")
+REPR_ARGS = SimpleNamespace(reward_coef=10.0, state_coef=0.3, obs_coef=0.03, kl_coef=0.03)
 
 
 # ---------------------------------------------------------------- stage 1
@@ -82,10 +82,8 @@ def test_algorithm_1_line_by_line() -> None:
     assert torch.allclose(losses["state"], ((s_next - s) ** 2).sum(1).mean(), atol=1e-5)
     assert torch.allclose(losses["obs"], ((o_next - o) ** 2).sum(1).mean(), atol=1e-5)
     kl = 0.5 * (q_s.mean**2 + q_s.variance - 1 - q_s.variance.log())
-    assert torch.allclose(losses["kl"], kl.sum(1).mean(), atol=1e-5)
-    mean_args = SimpleNamespace(**{**vars(REPR_ARGS), "kl_reduction": "mean"})
-    assert torch.allclose(aib_repr.repr_losses(model, batch, mean_args)["kl"], kl.mean(), atol=1e-5)
-    total = 10 * losses["reward"] + 0.3 * losses["state"] + 0.03 * losses["obs"] + 0.01 * losses["kl"]
+    assert torch.allclose(losses["kl"], kl.mean(), atol=1e-5), "over dimensions, too"
+    total = 10 * losses["reward"] + 0.3 * losses["state"] + 0.03 * losses["obs"] + 0.03 * losses["kl"]
     assert torch.allclose(losses["total"], total)
     model["g"].reward_mean.fill_(0.5), model["g"].reward_std.fill_(2.0)
     torch.manual_seed(3)
@@ -117,11 +115,11 @@ def test_transitions_lie_within_an_episode_and_each_is_learnt_from_once_an_epoch
     read, transitions = [], aib_repr.TransitionDataset.__call__
     patched = lambda self, index: read.append(index) or transitions(self, index)  # noqa: E731
     monkeypatch.setattr(aib_repr.TransitionDataset, "__call__", patched)
-    train(aib_repr, num_episodes=20, val_fraction=0.25, epochs=2, batch_size=50)
+    train(aib_repr, num_episodes=20, epochs=2, batch_size=54)
     epochs, held_out = [np.concatenate(read[:3]), np.concatenate(read[4:7])], [read[3], read[7]]
-    assert all(sorted(epoch) == list(range(150)) for epoch in epochs), "of 15 episodes of 10 steps"
-    assert not np.array_equal(*epochs) and not np.array_equal(epochs[0], np.arange(150))
-    assert all(set(index) <= set(range(150, 200)) for index in held_out)
+    assert all(sorted(epoch) == list(range(160)) for epoch in epochs), "of 16 episodes of 10 steps"
+    assert not np.array_equal(*epochs) and not np.array_equal(epochs[0], np.arange(160))
+    assert all(set(index) <= set(range(160, 200)) for index in held_out)
 
 
 # ---------------------------------------------------------------- stage 2
@@ -376,18 +374,18 @@ def test_chrono_initialisation_sets_the_update_gate() -> None:
 
 
 def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_stages: Path) -> None:
-    rgb = np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "rgb.npy")[:15, ::8].astype(float)
+    rgb = np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "rgb.npy")[:16, ::8].astype(float)
     history = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)["belief"]
     assert torch.allclose(history["history.image_mean"].double(), torch.from_numpy(rgb.mean((0, 1))), atol=1e-3)
     assert abs(history["history.image_std"].item() - (rgb - rgb.mean((0, 1))).std()) < 1e-3
-    joints = torch.from_numpy(np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "joints.npy")[:15]).flatten(0, 1)
+    joints = torch.from_numpy(np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "joints.npy")[:16]).flatten(0, 1)
     assert torch.allclose(history["history.joints_mean"], joints.mean(0), atol=1e-4)
     assert torch.allclose(history["history.joints_std"], joints.std(0, correction=0), atol=1e-4)
     gate = history["history.gru.bias_ih"][256:512]
     assert gate.min() > -0.1 and 1 < gate.max() < math.log(9) + 0.1, "chrono_init, and three updates"
     model = torch.load(toy_stages / f"{TOY}__aib_repr__1" / "checkpoint.pt", weights_only=True)["model"]
     dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
-    rewards, state = (torch.from_numpy(np.load(dataset / f"{name}.npy")[:15]) for name in ("rewards", "state"))
+    rewards, state = (torch.from_numpy(np.load(dataset / f"{name}.npy")[:16]) for name in ("rewards", "state"))
     assert torch.allclose(model["g.reward_mean"], rewards.mean(), atol=1e-5)
     assert torch.allclose(model["g.reward_std"], rewards.std(correction=0), atol=1e-5)
     assert torch.allclose(model["phi.mean"], state.mean((0, 1)), atol=1e-5)

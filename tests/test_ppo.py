@@ -27,9 +27,9 @@ def small(module: ModuleType, toy_stages: Path, **changes: object) -> dict:
     """Arguments of a small run of a method on the toy stages of conftest."""
     more = {}
     if module is ppo_aib:
-        more = dict(belief=str(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt"), num_episodes=20)
+        more = dict(belief=str(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt"))
     elif module is ppo_believer:
-        more = dict(repr_dir=str(toy_stages / f"{TOY}__aib_repr__1"), num_episodes=20)
+        more = dict(repr_dir=str(toy_stages / f"{TOY}__aib_repr__1"))
         more |= dict(num_updates=3, batch_episodes=4)
     return {**SMALL, **more, **changes}
 
@@ -143,8 +143,8 @@ def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path
 
 
 def test_particle_noise_is_the_decoders(toy_stages: Path) -> None:
-    drawn, means = (play(toy_stages, sample_decoder=noise)[1]["particles"][0] for noise in (True, False))
-    assert drawn.std(1).mean() > 0.5 and means.std(1).mean() < 0.2  # the decoder's std is still about softplus(0) + 0.1
+    particles = play(toy_stages)[1]["particles"][0]
+    assert particles.std(1).mean() > 0.5, "the decoder's std is still about softplus(0) + 0.1, that of its means 0.1"
 
 
 @pytest.mark.parametrize("script", ["ppo_aib", "ppo_believer"])
@@ -396,7 +396,7 @@ def test_evaluate_plays_test_episodes_with_the_stored_agent(
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
 ) -> None:
     module, played = SCRIPTS[script], []
-    changes = dict(num_particles=5, sample_decoder=False)
+    changes = dict(num_particles=5)
     if script == "ppo_baseline":
         changes = dict(image_size=40, robot_triangles=7)
     file = train(module, **small(module, toy_stages, **changes)) / "agent.pt"
@@ -461,8 +461,7 @@ def test_table_5(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
 
 
 def test_small_settings_are_the_same_for_all_three_methods() -> None:
-    own = {"exp_name", "belief", "repr_dir", "num_episodes", "num_updates", "batch_episodes", "belief_lr"}
-    own |= {"warmup_updates", "prior_nll", "val_every"}
+    own = {"exp_name", "num_updates", "batch_episodes", "belief_lr", "warmup_updates", "prior_nll"}
     first, *others = ({name: x for name, x in SCRIPTS[s].SMALL.items() if name not in own} for s in METHODS)
     assert first["total_timesteps"] >= 100_000 and all(first == other for other in others)
     stage_2 = {name: x for name, x in aib_belief.SMALL.items() if name != "exp_name"}
@@ -476,5 +475,4 @@ def test_help_shows_what_will_run(monkeypatch: pytest.MonkeyPatch, capsys: pytes
         with pytest.raises(SystemExit):
             module.parse_args()
         shown = capsys.readouterr().out
-        assert "default: None" not in shown
         assert "10380000" in shown or not module.TASKS

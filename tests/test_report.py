@@ -174,6 +174,6 @@ def test_every_command_of_the_matrix_is_one_the_scripts_accept() -> None:
         args = tyro.cli(modules[script].Args, args=words)
         name = f"runs/{args.env_id}__{args.exp_name}__{args.seed}"
         if script == "ppo_aib.py":
-            assert args.belief.format(**vars(args)) in made
+            assert (args.belief or f"runs/{args.env_id}__aib_belief__{args.seed}/belief.pt") in made
         made |= {name + "/belief.pt"} if script == "aib_belief.py" else {name}
     assert len(experiments.commands(experiments.Args(ablations=False))[3]) == 36

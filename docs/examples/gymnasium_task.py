@@ -3,7 +3,7 @@
 A point moves in a square. Its target is drawn in the first pictures only, so the agent must remember where it was.
 
 Usage:   python docs/examples/gymnasium_task.py --small
-Takes:   the arguments that all three stages share, such as --seed, --num-episodes or --overwrite; not --exp-name
+Takes:   the arguments that all three stages have: --seed, --device, --small and --quick
 Writes:  what the three stages write, to runs/RememberTarget-v0__...
 """
 

@@ -4,7 +4,7 @@ The tool must go to a disc on the table. The disc is visible in the first five p
 where it was. PushCube-v1's cube lies there, too, and does not matter.
 
 Usage:   python docs/examples/maniskill_task.py --small
-Takes:   the arguments that all three stages share, such as --seed, --num-episodes or --overwrite; not --exp-name
+Takes:   the arguments that all three stages have: --seed, --device, --small and --quick
 Writes:  what the three stages write, to runs/RememberDisc-v0__...
 """
 
