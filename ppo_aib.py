@@ -226,6 +226,7 @@ class HistoryEncoder(nn.Module):
 
     The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
     it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
+    Keypoints do the same for questions that are always the same ones, as the moving ball's place.
     The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
@@ -240,18 +241,22 @@ class HistoryEncoder(nn.Module):
         lines = [torch.linspace(-1, 1, length // self.patch) for length in (height, width)]
         self.register_buffer("coordinates", torch.cartesian_prod(*lines))
         self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
-        self.heads = nn.Linear(64, 16 + 8 + 32)
-        self.code = nn.Linear(256, 16)
+        self.token_heads = nn.Linear(64, 16 + 8 + 32)
+        self.point = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 32, 32]), nn.ReLU()))
+        self.point_heads = nn.Linear(32, 16 + 8)
+        self.point_queries = nn.Parameter(torch.randn(8, 16))
+        self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
-        self.place = orthogonal_init(mlp([2 + 8, 64, 64]))
-        self.out = orthogonal_init(mlp([16 + 64, 256, 256]))
+        self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
+        self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
-        self.gru = nn.GRUCell(32 + 2 + 8, 256)
+        self.gru = nn.GRUCell(9 * (2 + 8) + 32, 256)
 
-    def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
-        """Images (B, H, W, 3) uint8 -> keys (B, N, 16) and contents (B, N, 10) of N patches, summary (B, 32).
+    def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
+        """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 80), summary.
 
-        Contents are coordinates and values. mask: share of the blocks of 2 x 2 pixels that are replaced by the mean.
+        Contents are coordinates and values; the summary is (B, 32). mask: share of the blocks of 2 x 2 pixels that are
+        replaced by the mean.
         """
         images = rgb.float().sub_(self.image_mean).div_(self.image_std)
         if mask:
@@ -259,31 +264,38 @@ class HistoryEncoder(nn.Module):
             kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
             images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
         # a convolution whose kernel and stride are a patch, as a linear layer
-        rows = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch)
-        tokens = self.token(rows.flatten(1, 2).flatten(2))
-        keys, values, features = self.heads(tokens).split([16, 8, 32], -1)
-        contents = torch.cat([self.coordinates.expand(len(rgb), -1, -1), values], -1)
-        return nn.functional.layer_norm(keys, [16]), contents, features.relu().amax(1)
+        patches = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch).flatten(1, 2).flatten(2)
+        coordinates = self.coordinates.expand(len(rgb), -1, -1)
+        keys, values, features = self.token_heads(self.token(patches)).split([16, 8, 32], -1)
+        contents = torch.cat([coordinates, values], -1)
+        point_keys, values = self.point_heads(self.point(patches)).split([16, 8], -1)
+        keypoints, _ = self.attend(self.point_queries, point_keys, torch.cat([coordinates, values], -1))
+        return keys, contents, keypoints.flatten(1), features.relu().amax(1)
 
-    def attend(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory (B, 16) asks patches (B, N, .) -> expected contents (B, 10), logarithms of the weights (B, N)."""
-        query = nn.functional.layer_norm(self.query(memory), [16])
-        log_weights = (keys @ query.unsqueeze(-1)).squeeze(-1).log_softmax(-1)
-        return (log_weights.exp().unsqueeze(-2) @ contents).squeeze(-2), log_weights
+    def attend(self, queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
+        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, 10), log weights (..., Q, N)."""
+        queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
+        log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
+        return log_weights.exp() @ contents, log_weights
 
-    def combine(self, memory: Tensor, place: Tensor, joints: Tensor) -> Tensor:
-        """h (..., 256) of memory (..., 16), place (..., 10) and joints (..., J)."""
+    def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
+        """Memory (..., 32), whose first half asks -> the place (..., 10), log weights of the patches (..., N)."""
+        place, log_weights = self.attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
+        return place.squeeze(-2), log_weights.squeeze(-2)
+
+    def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
+        """h (..., 256) of memory (..., 32), place and keypoints (..., 90) and joints (..., J)."""
         arm = self.arm((joints - self.joints_mean) / self.joints_std)
-        return self.out(torch.cat([memory, self.place(place)], -1)) + arm
+        return self.out(torch.cat([memory, self.place(places)], -1)) + arm
 
     def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
         if hidden is None:
             hidden = joints.new_zeros(len(rgb), 256)
-        keys, contents, summary = self.look(rgb)
+        keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
-        place, _ = self.attend(memory, keys, contents)
-        return self.combine(memory, place, joints), self.gru(torch.cat([summary, place], -1), hidden)
+        places = torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1)
+        return self.combine(memory, places, joints), self.gru(torch.cat([places, summary], -1), hidden)
 
 
 class AIBBelief(nn.Module):

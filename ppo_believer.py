@@ -103,6 +103,8 @@ class Args:
     """weight of KL(q || N(0, I))"""
     image_mask: float = 0.5
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
+    occlusion: float = 0.5
+    """share of the episodes of which a rectangle is hidden from a random step on while the belief is trained"""
     warmup_updates: int = 0
     """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
     prior_nll: float = 0.0
@@ -247,6 +249,7 @@ class HistoryEncoder(nn.Module):
 
     The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
     it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
+    Keypoints do the same for questions that are always the same ones, as the moving ball's place.
     The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
@@ -261,18 +264,22 @@ class HistoryEncoder(nn.Module):
         lines = [torch.linspace(-1, 1, length // self.patch) for length in (height, width)]
         self.register_buffer("coordinates", torch.cartesian_prod(*lines))
         self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
-        self.heads = nn.Linear(64, 16 + 8 + 32)
-        self.code = nn.Linear(256, 16)
+        self.token_heads = nn.Linear(64, 16 + 8 + 32)
+        self.point = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 32, 32]), nn.ReLU()))
+        self.point_heads = nn.Linear(32, 16 + 8)
+        self.point_queries = nn.Parameter(torch.randn(8, 16))
+        self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
-        self.place = orthogonal_init(mlp([2 + 8, 64, 64]))
-        self.out = orthogonal_init(mlp([16 + 64, 256, 256]))
+        self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
+        self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
-        self.gru = nn.GRUCell(32 + 2 + 8, 256)
+        self.gru = nn.GRUCell(9 * (2 + 8) + 32, 256)
 
-    def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
-        """Images (B, H, W, 3) uint8 -> keys (B, N, 16) and contents (B, N, 10) of N patches, summary (B, 32).
+    def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
+        """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 80), summary.
 
-        Contents are coordinates and values. mask: share of the blocks of 2 x 2 pixels that are replaced by the mean.
+        Contents are coordinates and values; the summary is (B, 32). mask: share of the blocks of 2 x 2 pixels that are
+        replaced by the mean.
         """
         images = rgb.float().sub_(self.image_mean).div_(self.image_std)
         if mask:
@@ -280,31 +287,38 @@ class HistoryEncoder(nn.Module):
             kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
             images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
         # a convolution whose kernel and stride are a patch, as a linear layer
-        rows = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch)
-        tokens = self.token(rows.flatten(1, 2).flatten(2))
-        keys, values, features = self.heads(tokens).split([16, 8, 32], -1)
-        contents = torch.cat([self.coordinates.expand(len(rgb), -1, -1), values], -1)
-        return nn.functional.layer_norm(keys, [16]), contents, features.relu().amax(1)
+        patches = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch).flatten(1, 2).flatten(2)
+        coordinates = self.coordinates.expand(len(rgb), -1, -1)
+        keys, values, features = self.token_heads(self.token(patches)).split([16, 8, 32], -1)
+        contents = torch.cat([coordinates, values], -1)
+        point_keys, values = self.point_heads(self.point(patches)).split([16, 8], -1)
+        keypoints, _ = self.attend(self.point_queries, point_keys, torch.cat([coordinates, values], -1))
+        return keys, contents, keypoints.flatten(1), features.relu().amax(1)
 
-    def attend(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory (B, 16) asks patches (B, N, .) -> expected contents (B, 10), logarithms of the weights (B, N)."""
-        query = nn.functional.layer_norm(self.query(memory), [16])
-        log_weights = (keys @ query.unsqueeze(-1)).squeeze(-1).log_softmax(-1)
-        return (log_weights.exp().unsqueeze(-2) @ contents).squeeze(-2), log_weights
+    def attend(self, queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
+        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, 10), log weights (..., Q, N)."""
+        queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
+        log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
+        return log_weights.exp() @ contents, log_weights
 
-    def combine(self, memory: Tensor, place: Tensor, joints: Tensor) -> Tensor:
-        """h (..., 256) of memory (..., 16), place (..., 10) and joints (..., J)."""
+    def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
+        """Memory (..., 32), whose first half asks -> the place (..., 10), log weights of the patches (..., N)."""
+        place, log_weights = self.attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
+        return place.squeeze(-2), log_weights.squeeze(-2)
+
+    def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
+        """h (..., 256) of memory (..., 32), place and keypoints (..., 90) and joints (..., J)."""
         arm = self.arm((joints - self.joints_mean) / self.joints_std)
-        return self.out(torch.cat([memory, self.place(place)], -1)) + arm
+        return self.out(torch.cat([memory, self.place(places)], -1)) + arm
 
     def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
         if hidden is None:
             hidden = joints.new_zeros(len(rgb), 256)
-        keys, contents, summary = self.look(rgb)
+        keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
-        place, _ = self.attend(memory, keys, contents)
-        return self.combine(memory, place, joints), self.gru(torch.cat([summary, place], -1), hidden)
+        places = torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1)
+        return self.combine(memory, places, joints), self.gru(torch.cat([places, summary], -1), hidden)
 
 
 class Teacher(nn.Module):
@@ -393,41 +407,49 @@ class Agent(nn.Module):
 def encode_history(
     history: nn.Module, batch: dict[str, Tensor], mask: float = 0.0, teacher_memory: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """h (T+1, B, 256) and memory (T+1, B, 16) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J).
+    """h (T+1, B, 256) and memory (T+1, B, 32) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J).
 
-    teacher_memory (T+1, B, 16), if given, asks and answers in place of the memory, which is returned all the same.
+    teacher_memory (T+1, B, 16), if given, stands in h for the half of the memory that asks; the GRU keeps its own.
     """
     seen = [history.look(rgb, mask) for rgb in batch["rgb"].flatten(0, 1).split(IMAGE_CHUNK)]
-    keys, contents, summary = (torch.cat(x).unflatten(0, batch["rgb"].shape[:2]) for x in zip(*seen, strict=True))
+    keys, contents, keypoints, summary = (
+        torch.cat(x).unflatten(0, batch["rgb"].shape[:2]) for x in zip(*seen, strict=True)
+    )
     hidden, memories, places = batch["joints"].new_zeros(keys.shape[1], 256), [], []
-    for t, step in enumerate(zip(keys, contents, summary, strict=True)):
+    for *patches, points, features in zip(keys, contents, keypoints, summary, strict=True):
         memories.append(history.code(hidden))
-        used = memories[-1] if teacher_memory is None else teacher_memory[t]
-        place, _ = history.attend(used, *step[:2])
-        places.append(place)
-        hidden = history.gru(torch.cat([step[2], place], -1), hidden)
-    memory, place = torch.stack(memories), torch.stack(places)
-    used = memory if teacher_memory is None else teacher_memory
-    return history.combine(used, place, batch["joints"]), memory
+        places.append(torch.cat([history.ask(memories[-1], *patches)[0], points], -1))
+        hidden = history.gru(torch.cat([places[-1], features], -1), hidden)
+    memory, places = torch.stack(memories), torch.stack(places)
+    if teacher_memory is None:
+        return history.combine(memory, places, batch["joints"]), memory
+    taught = torch.cat([teacher_memory, memory[..., 16:]], -1)
+    places = torch.cat([history.ask(taught, keys, contents)[0], keypoints], -1)
+    return history.combine(taught, places, batch["joints"]), memory
 
 
 def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
 
     The teacher's memory, of the privileged state at the episode's start, asks in place of the GRU's (as the first
-    phase of Kumar et al., 2021). error: of u from z ~ p(z). place: -log sum_i w_i N(u; locator(patch i)) over the
-    attention's weights w_i, which tells the attention where u says that the object is; locator: its error of u.
+    phase of Kumar et al., 2021). error: of u from z ~ p(z), mean of three. place: -log sum_i w_i N(u; locator(patch i))
+    over the attention's weights w_i, which tells it where u says that the object is; locator: its error of u.
     """
-    belief, u = model["belief"], batch["u"]
-    keys, contents, _ = belief.history.look(batch["rgb"], args.image_mask)
+    belief, history, u = model["belief"], model["belief"].history, batch["u"]
+    keys, contents, keypoints, _ = history.look(batch["rgb"], args.image_mask)
     memory = model["teacher"](batch["u_0"], batch["t"])
-    place, log_weights = belief.history.attend(memory, keys, contents)
-    h = belief.history.combine(memory, place, belief.history.joints_mean)  # without joints, which identify an episode
-    decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device))
+    memory = torch.cat([memory, torch.zeros_like(memory)], -1)
+    place, log_weights = history.ask(memory, keys, contents)
+    losses = {"error": 0.0}
+    # all that is known, then the place alone and keypoints alone: else nobody looks for what the memory knows
+    for knows_memory, knows_place, knows_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
+        places = torch.cat([knows_place * place, knows_keypoints * keypoints], -1)
+        h = history.combine(knows_memory * memory, places, history.joints_mean)  # joints would identify an episode
+        decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
+        losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
     located = model["locator"](contents)
     # the locator's mean is fitted at the attended place alone: fitted here, it could place objects anywhere
     log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
-    losses = {"error": (decoded.mean.squeeze(-2) - u).square().sum(-1).mean()}
     losses["locator"] = (model["locator"](place.detach()).mean - u).square().sum(-1).mean()
     losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
     losses["total"] = sum(losses.values())
@@ -440,7 +462,7 @@ def history_losses(
     """h (T+1, B, 256) of whole episodes, and what trains it beside the ELBO; zeros where the arguments say so.
 
     prior_nll: -log p(u|z,h) with z from the prior. memory: squared error of the memory from the teacher's.
-    teacher_acts: h is of the teacher's memory, the GRU's only follows it.
+    teacher_acts: h is of the teacher's memory, the GRU's own only follows it.
     """
     t = torch.arange(len(batch["u"]), device=batch["u"].device)
     u_0 = batch["u"][0].expand_as(batch["u"])
@@ -454,7 +476,7 @@ def history_losses(
         decoded = model["belief"].decode(h, torch.randn(*h.shape[:-1], 1, args.z_dim, device=h.device))
         losses["prior_nll"] = -decoded.log_prob(batch["u"].unsqueeze(-2)).sum(-1).mean()
     if args.warmup_updates:
-        losses["memory"] = (memory - teacher_memory).square().sum(-1).mean()
+        losses["memory"] = (memory[..., :16] - teacher_memory).square().sum(-1).mean()
     return h, losses
 
 
@@ -507,12 +529,22 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 # ---------------------------------------------------------------- data
 
 
+def hide_rectangles(rgb: Tensor, share: float, rng: np.random.Generator) -> None:
+    """In a share of episodes (T+1, B, H, W, 3) hide a rectangle from a random step on, as the arm hides objects."""
+    steps, episodes, height, width, _ = rgb.shape
+    for episode in np.flatnonzero(rng.random(episodes) < share):
+        t, size = rng.integers(steps), rng.integers((height // 4, width // 4), (height // 2, width // 2))
+        (top, left), (bottom, right) = (corner := rng.integers((height, width) - size)), corner + size
+        colour = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
+        rgb[t:, episode, top:bottom, left:right] = colour
+
+
 class EpisodeDataset:
     """Whole episodes of dataset/ and their u (N, T+1, u_dim), on the disk, or on the GPU where they fit there."""
 
     def __init__(self, dataset: Path, u: Tensor, device: str):
         self.device, self.arrays = device, {"u": u.to(device)}
-        for name in ("rgb", "joints", "actions", "cue"):
+        for name in ("rgb", "joints", "actions"):
             x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of read-only arrays
             fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
             self.arrays[name] = x.to(device) if fits else x
@@ -521,9 +553,8 @@ class EpisodeDataset:
         return len(self.arrays["u"])
 
     def __call__(self, index: np.ndarray) -> dict[str, Tensor]:
-        """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A), cue (B, K)."""
-        batch = {name: x[index].to(self.device) for name, x in self.arrays.items()}
-        return {name: x if name == "cue" else x.transpose(0, 1) for name, x in batch.items()}
+        """Episodes index (B,): rgb (T+1, B, H, W, 3), joints, u (T+1, B, .), actions (T, B, A)."""
+        return {name: x[index].to(self.device).transpose(0, 1) for name, x in self.arrays.items()}
 
     def frames(self, episode: np.ndarray, t: np.ndarray) -> dict[str, Tensor]:
         """Single frames of episodes (B,) at steps t (B,): rgb (B, H, W, 3), u, t, and the episode's first u, u_0."""
@@ -678,8 +709,7 @@ def train_belief(args: Args, path: Path) -> None:
     task = {name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size")}
     episodes, stored = load_episodes(args, **task)
     num_val = stored["num_val"]
-    # aib_belief.py fits its linear probes on the episodes between the two
-    train, _, test_on = np.split(np.arange(len(episodes)), [-num_val, -(num_val // 2)])
+    train, held_out = np.split(np.arange(len(episodes)), [-num_val])
     sample = episodes(train[:1])
     config = {
         "image_shape": list(sample["rgb"].shape[2:]),
@@ -714,14 +744,18 @@ def train_belief(args: Args, path: Path) -> None:
         rng = np.random.default_rng([args.seed, update])
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
         progress = (update - args.warmup_updates - 1) / args.num_updates
-        optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - progress))
+        of_phase = progress if progress >= 0 else (update - 1) / args.warmup_updates
+        optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - of_phase))
         model["teacher"].train(progress < 0)
         if progress < 0:
             episode = rng.choice(train, 8 * args.batch_episodes)
-            frames = episodes.frames(episode, rng.integers(len(sample["rgb"]), size=len(episode)))
+            # early steps more often, as they show what is to be remembered
+            t = (len(sample["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
+            frames = episodes.frames(episode, t)
             losses = warmup_losses(model, frames, args)
         else:
             batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
+            hide_rectangles(batch["rgb"], args.occlusion, rng)
             losses = believer_losses(model, batch, args, teacher_acts=progress < 0.5)
         optimizer.zero_grad()
         losses["total"].backward()
@@ -733,7 +767,7 @@ def train_belief(args: Args, path: Path) -> None:
                 writer.add_scalar(f"belief/{name}", value, update)
 
         if update % VAL_EVERY == 0 or update == num_updates:
-            u, estimate = validate_belief(model["belief"], episodes, test_on)
+            u, estimate = validate_belief(model["belief"], episodes, held_out)
             error = (u - estimate).square().sum(-1).mean().item()
             writer.add_scalar("belief/held_out_error", error, update)
             bar.set_postfix(held_out_error=f"{error:.3f}")
@@ -742,10 +776,11 @@ def train_belief(args: Args, path: Path) -> None:
             save(path / "belief_checkpoint.pt", checkpoint)
 
     # no early stopping: held-out error is best before h holds the cue
+    for t in range(len(u)):
+        writer.add_scalar("belief/held_out_u_r2_by_step", r_squared(u[t], estimate[t]), t)
     writer.close()
     content = {**asdict(args), "config": config, "belief": model["belief"].state_dict()}
     save(path / "belief.pt", content)
-    u, estimate = validate_belief(model["belief"], episodes, test_on)
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {r_squared(u[-1], estimate[-1]):.2f}")
 
 

@@ -11,12 +11,16 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import aib_belief
 import aib_repr
 import ppo_aib
 import ppo_believer
 from conftest import ROOT, SCRIPTS, TOY, train
+
+sys.path.append(str(ROOT / "benchmark"))
+import belief as probes  # noqa: E402
 
 
 def make_stage_1(folder: Path, episodes: int) -> int:
@@ -54,34 +58,38 @@ def test_peak_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path) -
     assert peaks[1] - peaks[0] < 0.25 * (sizes[1] - sizes[0])
 
 
-def test_readouts_are_fitted_on_one_half_of_the_held_out_episodes_and_tested_on_the_other(
+def test_the_last_episodes_are_held_out_and_the_last_weights_kept(
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looks, encoded, encode = [], [], aib_belief.encode
+    looks, validated, validate_belief = [], [], aib_belief.validate_belief
     read = note_episodes(monkeypatch, aib_belief)
 
-    def recorded(belief: torch.nn.Module, *arguments: object) -> dict[str, torch.Tensor]:
-        looks.append((arguments[-1].tolist(), {name: x.clone() for name, x in belief.state_dict().items()}))
-        encoded.append(encode(belief, *arguments))
-        return encoded[-1]
+    def recorded(belief: torch.nn.Module, episodes: object, index: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        looks.append((index.tolist(), {name: x.clone() for name, x in belief.state_dict().items()}))
+        validated.append(validate_belief(belief, episodes, index))
+        return validated[-1]
 
-    monkeypatch.setattr(aib_belief, "encode", recorded)
+    monkeypatch.setattr(aib_belief, "validate_belief", recorded)
     monkeypatch.setattr(aib_belief, "VAL_EVERY", 2)
     repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
-    path = train(aib_belief, repr_dir=repr_dir, num_updates=6, batch_episodes=4)
-    fit, test = [16, 17], [18, 19]  # of 20 episodes, the last four of which are held out
-    trained = [index for index in read if len(index) == 4]
+    path = train(aib_belief, repr_dir=repr_dir, num_updates=6, batch_episodes=5)
+    held_out = [16, 17, 18, 19]  # of 20 episodes
+    trained = [index for index in read if len(index) == 5]
     assert len(trained) == 6 and max(map(max, trained)) < 16
-    assert [episodes for episodes, _ in looks] == [test] * 3 + [fit, test]
+    assert [episodes for episodes, _ in looks] == [held_out] * 3
     stored = torch.load(path / "belief.pt", weights_only=True)
     phi = torch.load(Path(repr_dir) / "repr.pt", weights_only=True)["phi"]
     assert all(torch.equal(stored["belief"][f"phi.{name}"], x) for name, x in phi.items()), (
         "PPO's evaluation needs it for u"
     )
-    state = torch.from_numpy(np.load(Path(repr_dir) / "dataset" / "state.npy")[test])
+    state = torch.from_numpy(np.load(Path(repr_dir) / "dataset" / "state.npy")[held_out])
     encoder = aib_belief.StateEncoder(4, 16)
     encoder.load_state_dict(phi)
-    assert torch.allclose(encoded[-1]["u"], encoder(state).mean, atol=1e-6), "the mean of phi(s)"
+    u, estimate = validated[-1]
+    assert torch.allclose(u, encoder(state).mean.transpose(0, 1), atol=1e-6), "the mean of phi(s)"
+    events = EventAccumulator(str(path)).Reload().Scalars("belief/held_out_u_r2_by_step")
+    assert [event.step for event in events] == list(range(11))
+    assert events[-1].value == pytest.approx(aib_belief.r_squared(u[-1], estimate[-1]))
     stored = stored["belief"]
     assert all(torch.equal(stored[name], x) for name, x in looks[2][1].items())  # the last weights
     assert any((stored[name] != x).any() for name, x in looks[1][1].items())
@@ -100,9 +108,9 @@ def test_believers_belief_gets_the_episodes_phi_and_statistics_of_aibs(
     read, repr_dir = note_episodes(monkeypatch, ppo_believer), toy_stages / f"{TOY}__aib_repr__1"
     sizes = dict(num_updates=3, batch_episodes=4, num_envs=4, total_timesteps=40, num_minibatches=2)
     path = train(ppo_believer, repr_dir=str(repr_dir), num_eval_episodes=2, **sizes)
-    trained = [index for index in read if len(index) == 4]
+    trained = [index for index in read if len(index) == 4 and 16 not in index]
     assert len(trained) == 3 and max(map(max, trained)) < 16
-    assert [index for index in read if len(index) == 2] == [[18, 19]] * 2
+    assert [index for index in read if 16 in index] == [[16, 17, 18, 19]]
     belief = torch.load(path / "belief.pt", weights_only=True)["belief"]
     stage_1 = torch.load(repr_dir / "repr.pt", weights_only=True)
     assert all(torch.equal(belief[f"phi.{name}"], x) for name, x in stage_1["phi"].items())
@@ -147,6 +155,7 @@ def test_warm_up_then_the_teacher_acts_then_the_memory(
 def test_ablations_train(toy_task: Path, toy_stages: Path, variant: dict) -> None:
     repr_dir = str(toy_stages / f"{TOY}__aib_repr__1")
     path = train(aib_belief, repr_dir=repr_dir, num_updates=1, batch_episodes=4, **variant)
+    probes.main(probes.Args(path))
     report = json.loads((path / "diagnostics.json").read_text())
     assert len(report["u_r2_prior"]) == 11 and "flow_gain" not in report
 

@@ -77,9 +77,14 @@ def test_results(quick_runs: Path, script: str) -> None:
 
 
 def test_stages_leave_their_diagnostics(quick_runs: Path) -> None:
-    report = json.loads((quick_runs / f"{TASK}__aib_belief_quick__1" / "diagnostics.json").read_text())
-    assert {"nll_prior", "nll_posterior", "action_readout", "cue_chance", "flow_gain"} <= report.keys()
-    assert len(report["cue_from_h"]) == len(report["u_r2_prior"]) == 61
+    for script in ("aib_belief", "ppo_believer"):
+        path = quick_runs / f"{TASK}__{script}_quick__1"
+        code, out, err = run("benchmark/belief", "--run", str(path), cwd=quick_runs.parent)
+        assert code == 0, out + err
+        report = json.loads((path / "diagnostics.json").read_text())
+        assert {"nll_prior", "nll_posterior", "action_readout", "cue_chance"} <= report.keys()
+        assert ("flow_gain" in report) == (script == "aib_belief")
+        assert len(report["cue_from_h"]) == len(report["u_r2_prior"]) == 61
     events = EventAccumulator(str(quick_runs / f"{TASK}__ppo_believer_quick__1" / "belief_events")).Reload()
     assert "belief/held_out_error" in events.Tags()["scalars"]
     events = EventAccumulator(str(quick_runs / f"{TASK}__aib_repr_quick__1")).Reload()

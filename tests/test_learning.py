@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 
 import aib_belief
 import aib_repr
-from conftest import SCRIPTS, train
+from conftest import ROOT, SCRIPTS, train
+
+sys.path.append(str(ROOT / "benchmark"))
+import belief as probes  # noqa: E402
 
 REPR = dict(num_episodes=300, epochs=12, batch_size=100, learning_rate=1e-3, psi_images=False, num_workers=100)
 BELIEF = dict(num_updates=150, batch_episodes=24, belief_lr=1e-3)
@@ -20,7 +24,9 @@ PPO |= dict(eval_every=5, num_eval_episodes=192, ent_coef=0.0, num_workers=64)
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (2, 3))])
 def test_belief_solves_what_plain_ppo_cannot(toy_task: Path, seed: int) -> None:
     train(aib_repr, seed=seed, **REPR)
-    belief = json.loads((train(aib_belief, seed=seed, **BELIEF) / "diagnostics.json").read_text())
+    belief = train(aib_belief, seed=seed, **BELIEF)
+    probes.main(probes.Args(belief))
+    belief = json.loads((belief / "diagnostics.json").read_text())
     assert belief["cue_from_particle"][-1] > 0.95
     success = {}
     for name in ("ppo_aib", "ppo_believer", "ppo_baseline"):

@@ -1,6 +1,7 @@
 """Closed forms of every loss, the algorithm's lines, and where gradients go."""
 
 import math
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +16,10 @@ import aib_repr
 import ppo_aib
 import ppo_baseline
 import ppo_believer
-from conftest import TOY, spaces, train
+from conftest import ROOT, TOY, spaces, train
+
+sys.path.append(str(ROOT / "benchmark"))
+import belief as probes  # noqa: E402
 
 IMAGE = [36, 36, 3]
 CONFIG = {"image_shape": IMAGE, "joints_dim": 7, "state_dim": 5, "u_dim": 4, "z_dim": 5}
@@ -223,7 +227,7 @@ def test_believer_has_a_fixed_prior() -> None:
 def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
     model, batch = belief_model(), belief_batch()
     belief, posterior = model["belief"], model["posterior"]
-    seen = aib_belief.encode(belief, posterior, lambda index: batch, np.arange(B))
+    seen = probes.encode(belief, posterior, lambda index: batch, torch.zeros(B, 1), np.arange(B))
     torch.manual_seed(0)
     with torch.no_grad():
         h = aib_belief.encode_history(belief.history, batch)[0]
@@ -241,7 +245,7 @@ def test_held_out_prior_likelihood_is_that_of_the_particles_mixture() -> None:
 def test_sequence_and_step_path_agree() -> None:
     history, batch, hidden = belief_model()["belief"].history, belief_batch(), None
     whole, memory = aib_belief.encode_history(history, batch)
-    assert whole.shape == (T + 1, B, 256) and memory.shape == (T + 1, B, 16)
+    assert whole.shape == (T + 1, B, 256) and memory.shape == (T + 1, B, 32)
     for t in range(T + 1):
         if t:
             assert torch.allclose(history.code(hidden), memory[t], atol=1e-5), "of the state before the picture"
@@ -269,16 +273,39 @@ def test_gradients_reach_the_first_frame_and_come_in_chunks_as_well(monkeypatch:
 def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
     history, rgb = belief_model()["belief"].history, torch.zeros(2, *IMAGE, dtype=torch.uint8)
     rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255  # a patch is 2 x 2 pixels here
-    keys, contents, _ = history.look(rgb)
+    keys, contents, keypoints, summary = history.look(rgb)
     assert keys.shape == (2, 18**2, 16) and contents.shape == (2, 18**2, 10)
+    assert keypoints.shape == (2, 8 * 10) and summary.shape == (2, 32)
     patches = [2 * 18 + 5, 15 * 18 + 10]
     assert torch.allclose(keys[0, patches[0]], keys[1, patches[1]]), "a key holds no coordinates"
     assert torch.allclose(keys[0, 0], keys[1, 99]) and not torch.allclose(keys[0, 0], keys[0, patches[0]])
-    history.query = nn.Identity()
-    place, log_weights = history.attend(keys[0, patches[0]].expand(2, -1) * 50, keys * 50, contents)
+    history.query = nn.Identity()  # the first half of the memory asks for the first picture's patch
+    memory = torch.cat([keys[0, patches[0]].expand(2, -1), torch.randn(2, 16)], -1)
+    place, log_weights = history.ask(memory, keys, contents)
     assert log_weights.argmax(-1).tolist() == patches and torch.allclose(log_weights.exp().sum(-1), torch.ones(2))
+    query, key = (nn.functional.layer_norm(x, [16]) for x in (memory[:, None, :16], keys))
+    weights = (query * key).sum(-1).softmax(-1)
+    assert torch.allclose(log_weights.exp(), weights, atol=1e-5)
+    assert torch.allclose(place, (weights[..., None] * contents).sum(1), atol=1e-5)
     row_and_column = [[2 / 17 * 2 - 1, 5 / 17 * 2 - 1], [15 / 17 * 2 - 1, 10 / 17 * 2 - 1]]
-    assert torch.allclose(place[:, :2], torch.tensor(row_and_column), atol=1e-3)
+    assert torch.allclose(contents[[0, 1], patches, :2], torch.tensor(row_and_column))
+
+
+def test_keypoints_move_with_what_they_show() -> None:
+    history, rgb = belief_model()["belief"].history, torch.zeros(2, *IMAGE, dtype=torch.uint8)
+    rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255
+    patches = torch.tensor([2 * 18 + 5, 15 * 18 + 10])
+    with torch.no_grad():  # one that shows red alone
+        history.point_heads.weight[:16], history.point_heads.bias[:16] = torch.randn(16, 32), 0
+        images = (rgb.float() - history.image_mean) / history.image_std
+        red = images[0, 4:6, 10:12].flatten()
+        history.point_queries[0] = 30 * history.point_heads(history.point(red))[:16]
+    history.attend = lambda queries, keys, contents: (
+        (50 * nn.functional.layer_norm(queries, [16]) @ nn.functional.layer_norm(keys, [16]).mT).softmax(-1) @ contents,
+        None,
+    )
+    places = history.look(rgb)[2].unflatten(1, (8, 10))[:, 0, :2]
+    assert torch.allclose(places, history.coordinates[patches], atol=0.05)
 
 
 def test_masks_hide_blocks_of_two_by_two_pixels() -> None:
@@ -305,14 +332,17 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     u_0 = batch["u_0"]
     standard = (u_0 - u_0.mean(0)) / (u_0.var(0, correction=0) + 0.05**2).sqrt()
     memory = model["teacher"].net(torch.cat([standard, (batch["t"] + 1).log()[:, None]], -1))
-    keys, contents, _ = history.look(batch["rgb"])
-    weights = (keys * torch.nn.functional.layer_norm(history.query(memory), [16])[:, None]).sum(-1).softmax(-1)
-    place = (weights[..., None] * contents).sum(1)
-    h = history.out(torch.cat([memory, history.place(place)], -1)) + history.arm.bias
-    p = belief.prior(h)
+    keys, contents, keypoints, _ = history.look(batch["rgb"])
+    place, log_weights = history.ask(memory, keys, contents)
+    weights, errors = log_weights.exp(), []
+    memory = torch.cat([memory, torch.zeros(B, 16)], -1)
     torch.manual_seed(3)
-    decoded = belief.decoder(torch.cat([p.mean + p.stddev * torch.randn(B, 1, 5)[:, 0], h], -1))
-    assert torch.allclose(losses["error"], (decoded.mean - batch["u"]).square().sum(-1).mean(), atol=1e-4)
+    for parts in ((memory, place, keypoints), (0 * memory, place, 0 * keypoints), (0 * memory, 0 * place, keypoints)):
+        h = history.out(torch.cat([parts[0], history.place(torch.cat(parts[1:], -1))], -1)) + history.arm.bias
+        p = belief.prior(h)
+        decoded = belief.decoder(torch.cat([p.mean + p.stddev * torch.randn(B, 1, 5)[:, 0], h], -1))
+        errors.append((decoded.mean - batch["u"]).square().sum(-1).mean())
+    assert torch.allclose(losses["error"], sum(errors) / 3, atol=1e-4)
     located = model["locator"](contents)
     density = Normal(located.mean, located.stddev).log_prob(batch["u"][:, None]).sum(-1).exp()
     assert torch.allclose(losses["place"], -(weights * density).sum(-1).log().mean(), atol=1e-4)
@@ -341,7 +371,7 @@ def test_beside_the_elbo_the_prior_and_the_memory_are_trained() -> None:
         wanted = torch.stack([model["teacher"](batch["u"][0], torch.full((B,), t)) for t in range(T + 1)])
         used = wanted if teacher_acts else None
         h, memory = aib_belief.encode_history(model["belief"].history, batch, 0.0, used)
-        assert torch.allclose(losses["memory"], (memory - wanted).square().sum(-1).mean(), atol=1e-5)
+        assert torch.allclose(losses["memory"], (memory[..., :16] - wanted).square().sum(-1).mean(), atol=1e-5)
         grads = torch.autograd.grad(losses["memory"], list(model["teacher"].parameters()), allow_unused=True)
         assert all(grad is None for grad in grads), "the teacher does not follow"
         torch.manual_seed(4)
@@ -441,7 +471,7 @@ def test_readout_score_on_features_of_known_content() -> None:
 
     def score(y: torch.Tensor, features: torch.Tensor = x, count: int = 2000) -> float:
         fit, test = slice(0, count), slice(2000, 3000)
-        return aib_belief.probe_score(features[fit], y[fit], features[test], y[test])
+        return probes.probe_score(features[fit], y[fit], features[test], y[test])
 
     assert score((x[:, :1] > 0).float() * 3, x[:, :6]) > 0.95, "two colours"
     assert score(torch.bucketize(x[:, :1], torch.tensor([-0.5, 0.5])).float(), x[:, :1]) > 0.9, "three on a line"
@@ -463,7 +493,7 @@ def test_report_of_a_belief_that_knows_and_of_its_chance() -> None:
         seen |= {"z_mean": torch.randn(40, T + 1, 5), "actions": torch.rand(40, T, A)}
         seen["z_mean"][:, 1:, :A] = seen["actions"]
         seen["u_prior"][:, -1] = torch.randn_like(u[:, -1])
-        report = aib_belief.probe_belief(*({name: x[part] for name, x in seen.items()} for part in (SELECT, REPORT)))
+        report = probes.probe_belief(*({name: x[part] for name, x in seen.items()} for part in (SELECT, REPORT)))
         assert report["cue_chance"] == pytest.approx(chance)
         assert (report["nll_prior"], report["nll_posterior"]) == (1, 0)
         assert report["cue_from_particle"][-1] < 0.8 < 0.95 < report["cue_from_u"][-1]
@@ -483,9 +513,9 @@ def test_flow_gain_tells_a_live_head_from_a_dead_one() -> None:
         a_tau, tau, z_next = x[..., :A], x[..., A : A + 1], x[..., A + 1 + 5 :]
         return (z_next[..., :A] - a_tau) / (1 - tau).clamp(min=1e-3)
 
-    loss, gain = aib_belief.flow_gain(live, q, action)
+    loss, gain = probes.flow_gain(live, q, action)
     assert loss < 1e-4 and gain > 0.5
-    loss, gain = aib_belief.flow_gain(lambda x: torch.zeros_like(x[..., :A]), q, action)
+    loss, gain = probes.flow_gain(lambda x: torch.zeros_like(x[..., :A]), q, action)
     assert loss > 1 and gain == 0
 
 
@@ -548,3 +578,19 @@ def test_ppo_losses_are_the_closed_forms() -> None:
     assert torch.allclose(losses["total"], total)
     one = {name: x[:1] for name, x in batch.items()}  # a minibatch of one step, as --num-envs 1 may leave
     assert ppo_aib.ppo_losses(lambda _: (Normal(mean[:1], 1.0), value[:1]), one, args)["total"].isfinite()
+
+
+def test_hidden_rectangles_stay_until_the_end() -> None:
+    rgb = torch.full((20, 40, 36, 48, 3), 7, dtype=torch.uint8)
+    aib_belief.hide_rectangles(rgb, 0.5, np.random.default_rng(0))
+    hidden = (rgb != 7).any(-1)
+    assert 10 < hidden.any((0, 2, 3)).sum() < 30, "half of the episodes"
+    for episode in range(40):
+        seen = hidden[:, episode]
+        steps = seen.flatten(1).any(1).nonzero().flatten().tolist()
+        if steps:
+            assert steps == list(range(steps[0], 20)) and torch.equal(seen[steps[0]], seen[-1])
+            rows, columns = seen[-1].any(1), seen[-1].any(0)
+            assert 9 <= rows.sum() < 18 and 12 <= columns.sum() < 24
+            assert torch.equal(seen[-1], rows[:, None] & columns), "a rectangle"
+            assert len(rgb[-1, episode][seen[-1]].unique(dim=0)) == 1, "of one colour"
