@@ -54,11 +54,23 @@ bench: setup
 setup: .venv/installed vulkan
 
 .venv/installed: requirements.txt Makefile
-	$(PYTHON) -m venv .venv || { echo "error: $(PYTHON) cannot make a virtual environment; install python3-venv" >&2; exit 2; }
+	version=$$($(PYTHON) -c "import sys; print('%d.%d' % sys.version_info[:2])")
+	if [ "$$version" != 3.11 ] && [ "$$version" != 3.12 ]; then
+	    echo "error: $(PYTHON) is Python $$version, and the simulator has packages for 3.11 and 3.12 only; install one of" \
+	        "them and name it: make PYTHON=python3.11" >&2
+	    exit 2
+	fi
+	if ! [ -x .venv/bin/python$$version ]; then  # none yet, or one of another Python
+	    $(PYTHON) -m venv --clear .venv || { echo "error: $(PYTHON) cannot make a virtual environment; install python3-venv" >&2; exit 2; }
+	fi
 	$(PY) -m pip install --requirement requirements.txt
 	$(PY) -m pip install --no-deps --ignore-requires-python mikasa-robo-suite==1.0.0
 	$(PY) -m pip uninstall --yes opencv-python  # ManiSkill's choice needs libGL.so.1, which servers lack
 	$(PY) -m pip install --force-reinstall --no-deps opencv-python-headless
+	# SAPIEN makes a table for reflections of a sky at each start, most of the start on a CPU; these tasks have no sky
+	shaders=$$($(PY) -c "import sapien; print(sapien.__path__[0] + '/vulkan_shader/minimal')")
+	sed -i -e '/sampler2D samplerBRDFLUT;/d' -e 's/texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy/vec2(1, 0)/' "$$shaders"/*.frag
+	! grep -q samplerBRDFLUT "$$shaders"/*.frag || echo "warning: SAPIEN's shaders are not those that were expected; it starts slowly" >&2
 	touch .venv/installed
 
 # Rendering needs a Vulkan driver. Where neither a GPU's nor another one works, install Mesa's CPU driver, 24.3 or newer.

@@ -14,14 +14,10 @@ import json
 import math
 import multiprocessing
 import os
-import re
 import shutil
 import signal
 import sys
-import tempfile
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -460,23 +456,6 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
 
-# the next two make a CPU faster, at the cost of slightly different pictures
-
-
-@contextmanager
-def shaders_without_brdf_table() -> Iterator[None]:
-    """Start SAPIEN without its table for reflections of a sky, most of the start on a CPU: these tasks have no sky."""
-    shaders = Path(sapien.__file__).parent / "vulkan_shader"
-    with tempfile.TemporaryDirectory() as folder:
-        shutil.copytree(shaders, folder, dirs_exist_ok=True)
-        for file in Path(folder).glob("minimal/*.frag"):
-            text = re.sub(".*sampler2D samplerBRDFLUT;", "", file.read_text())
-            file.write_text(text.replace("texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy", "vec2(1, 0)"))
-        sapien.pysapien.render._internal_set_shader_search_path(folder)
-        yield
-    sapien.pysapien.render._internal_set_shader_search_path(str(shaders))
-
-
 def decimate_meshes(task: gym.Env, triangles: int) -> None:
     """Draw each mesh of the robot with about the given number of triangles at most; all else is drawn as it is.
 
@@ -511,23 +490,22 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
     """Build an environment: on physx_cuda a batch of num_scenes scenes, with tensors; else one scene, with arrays."""
     if multiprocessing.parent_process():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the main process, and a worker ends with it
-    with shaders_without_brdf_table() if args.render_backend == "sapien_cpu" else nullcontext():
-        env = gym.make(
-            args.env_id,
-            num_envs=num_scenes,
-            obs_mode="state_dict",
-            control_mode="pd_joint_delta_pos",
-            reward_mode="normalized_dense",
-            robot_uids="panda_wristcam",
-            sensor_configs={"width": args.image_size, "height": args.image_size},
-            sim_backend=args.sim_backend,
-            render_backend=args.render_backend,
-            reconfiguration_freq=0,  # ShellGame tasks would build the scene, with stock meshes, at every reset
-        )
-        env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
-        if args.robot_triangles:
-            decimate_meshes(env.unwrapped, args.robot_triangles)
-        env = PrivilegedInfoWrapper(env)
+    env = gym.make(
+        args.env_id,
+        num_envs=num_scenes,
+        obs_mode="state_dict",
+        control_mode="pd_joint_delta_pos",
+        reward_mode="normalized_dense",
+        robot_uids="panda_wristcam",
+        sensor_configs={"width": args.image_size, "height": args.image_size},
+        sim_backend=args.sim_backend,
+        render_backend=args.render_backend,
+        reconfiguration_freq=0,  # ShellGame tasks would build the scene, with stock meshes, at every reset
+    )
+    env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
+    if args.robot_triangles:
+        decimate_meshes(env.unwrapped, args.robot_triangles)
+    env = PrivilegedInfoWrapper(env)
     return env if args.sim_backend == "physx_cuda" else wrappers.CPUGymWrapper(env, ignore_terminations=True)
 
 

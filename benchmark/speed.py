@@ -11,7 +11,6 @@ import statistics
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 
 import gymnasium as gym
@@ -24,7 +23,7 @@ import ppo_aib  # noqa: E402
 def simulate(kind: str, env_id: str) -> tuple[float, np.ndarray]:
     """Median seconds of a step of one simulator, and 21 pictures (21, H, W, 3).
 
-    kind: stock, MIKASA-Robo's environment; ours; heavy, ours with SAPIEN's own shaders and meshes.
+    kind: stock, MIKASA-Robo's environment; ours; heavy, ours with SAPIEN's own meshes.
     """
     if kind == "stock":
         modes = dict(obs_mode="rgb", control_mode="pd_joint_delta_pos", reward_mode="normalized_dense")
@@ -33,8 +32,6 @@ def simulate(kind: str, env_id: str) -> tuple[float, np.ndarray]:
         env = ppo_aib.wrappers.FlattenRGBDObservationWrapper(env, rgb=True, depth=False, state=True)
         env = ppo_aib.wrappers.CPUGymWrapper(env, ignore_terminations=True)
     else:
-        if kind == "heavy":
-            ppo_aib.shaders_without_brdf_table = nullcontext
         triangles = 500 if kind == "ours" else 0
         env = ppo_aib.make_task(ppo_aib.Args(env_id=env_id, robot_triangles=triangles), 1)
     pictures, seconds, rng = [env.reset(seed=1)[0]["rgb"]], [], np.random.default_rng(0)
