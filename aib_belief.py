@@ -87,8 +87,14 @@ class Args:
 
 MAY_DIFFER = ()  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
-SMALL = dict(exp_name="aib_belief_small", num_updates=1500, batch_episodes=16, belief_lr=2e-3)
-SMALL |= dict(warmup_updates=4000, prior_nll=1.0)
+SMALL = dict(
+    exp_name="aib_belief_small",
+    num_updates=1500,
+    batch_episodes=16,
+    belief_lr=2e-3,
+    warmup_updates=4000,
+    prior_nll=1.0,
+)
 QUICK = dict(exp_name="aib_belief_quick", warmup_updates=2, num_updates=4, batch_episodes=4)
 
 

@@ -103,8 +103,15 @@ class Args:
 
 MAY_DIFFER = "num_workers"  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
-SMALL = dict(exp_name="aib_repr_small", num_envs=32, num_episodes=640, batch_size=100, learning_rate=1e-3)
-SMALL |= dict(image_size=64, epochs=7)
+SMALL = dict(
+    exp_name="aib_repr_small",
+    num_envs=32,
+    num_episodes=640,
+    image_size=64,
+    epochs=7,
+    batch_size=100,
+    learning_rate=1e-3,
+)
 QUICK = dict(exp_name="aib_repr_quick", num_envs=8, num_episodes=8, epochs=2)
 
 

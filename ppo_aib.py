@@ -141,10 +141,31 @@ TASKS = {  # Table 5, where it differs from the defaults above; any other task h
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
-SMALL = dict(exp_name="ppo_aib_small", total_timesteps=120_000, num_envs=16, num_minibatches=8, update_epochs=8)
-SMALL |= dict(gamma=0.95, target_kl=0.1, init_std=0.3, noise_beta=0.7, reward_norm=True, joints_norm=True)
-SMALL |= dict(image_size=64, eval_every=15, num_eval_episodes=64, amp=BFLOAT16)
-QUICK = dict(exp_name="ppo_aib_quick", total_timesteps=360, num_envs=2, num_minibatches=4, num_eval_episodes=2)
+SMALL = dict(
+    exp_name="ppo_aib_small",
+    total_timesteps=240_000,
+    num_envs=16,
+    num_minibatches=8,
+    update_epochs=8,
+    cnn_lr_scale=0.1,
+    gamma=0.95,
+    target_kl=0.1,
+    init_std=0.3,
+    noise_beta=0.7,
+    reward_norm=True,
+    joints_norm=True,
+    image_size=64,
+    eval_every=15,
+    num_eval_episodes=64,
+    amp=BFLOAT16,
+)
+QUICK = dict(
+    exp_name="ppo_aib_quick",
+    total_timesteps=360,
+    num_envs=2,
+    num_minibatches=4,
+    num_eval_episodes=2,
+)
 
 
 # ---------------------------------------------------------------- networks
@@ -472,7 +493,7 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
-    rgb = np.array(buffer["rgb"][:, :4].cpu())  # (T, 4, H, W, 3), a copy
+    rgb = buffer["rgb"][:, :4].cpu().numpy().copy()  # (T, 4, H, W, 3)
     succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
     rgb[1:, :, :4][succeeded] = (0, 255, 0)  # the top 4 rows of pixels
     rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)

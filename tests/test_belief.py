@@ -181,3 +181,39 @@ def test_earlier_stages_get_what_they_need_to_know(
     with pytest.raises(SystemExit):
         ppo_aib.run_stage("aib_repr.py", ppo_aib.Args(), [])
     assert "aib_repr.py was killed by signal 9" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("script", ["aib_belief", "ppo_believer"])
+def test_everything_learns_with_clipped_gradients_and_floors_of_the_deviations(
+    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    module, norms, floors = SCRIPTS[script], [], []
+    clip, init = torch.nn.utils.clip_grad_norm_, module.GaussianMLP.__init__
+
+    def noted_clip(parameters: object, max_norm: float, **options: object) -> torch.Tensor:
+        norms.append(max_norm)
+        return clip(parameters, max_norm, **options)
+
+    def noted_init(self: torch.nn.Module, inputs: int, hidden: list[int], size: int, min_std: float) -> None:
+        floors.append(min_std)
+        init(self, inputs, hidden, size, min_std)
+
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", noted_clip)
+    monkeypatch.setattr(module.GaussianMLP, "__init__", noted_init)
+    sizes = dict(warmup_updates=1, num_updates=1, batch_episodes=4)
+    if script == "ppo_believer":
+        sizes |= dict(num_envs=4, total_timesteps=40, num_minibatches=1, update_epochs=1, num_eval_episodes=2)
+    models = []
+    for rate in (0.0, 1e-3):
+        options = dict(repr_dir=str(toy_stages / f"{TOY}__aib_repr__1"), exp_name=f"rate_{rate}", belief_lr=rate)
+        path = train(module, **options, **sizes)
+        file = "checkpoint.pt" if script == "aib_belief" else "belief_checkpoint.pt"
+        models.append(torch.load(path / file, weights_only=True)["model"])
+    assert norms[:2] == [10.0, 10.0] and set(floors) == {0.1, 1e-5}, "1e-5 for phi alone"
+    parts = ["belief.history.gru.weight_ih", "belief.decoder.net.0.weight", "posterior.net.0.weight"]
+    parts += ["teacher.net.0.weight", "locator.mean.0.weight"]
+    if script == "aib_belief":
+        parts += ["belief.prior.net.0.weight", "head.0.weight"]
+    for part in parts:
+        assert not torch.equal(models[0][part], models[1][part]), part
+    assert torch.equal(models[0]["belief.phi.net.net.0.weight"], models[1]["belief.phi.net.net.0.weight"]), "frozen"

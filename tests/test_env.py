@@ -200,3 +200,31 @@ def test_random_actions_are_uniform_and_independent() -> None:
     assert abs(np.corrcoef(actions[:, 1:].ravel(), actions[:, :-1].ravel())[0, 1]) < 0.01
     assert np.array_equal(actions[7], aib_repr.random_actions(args, 7, 60, 8))
     assert not np.array_equal(actions[7], aib_repr.random_actions(aib_repr.Args(seed=2), 7, 60, 8))
+
+
+def test_success_and_reward_are_the_tasks_own(env: gym.Env) -> None:
+    task = env.unwrapped
+    _, info = env.reset(seed=11)
+    cue, action, found = int(info["cue"][0]), np.zeros(8, np.float32), []
+    for t in range(16):
+        if t == 14:  # the right cube, put into the hand
+            task.cubes[cue].set_pose(Pose.create_from_pq(task.agent.tcp.pose.p, task.cubes[cue].pose.q))
+        _, reward, _, _, info = env.step(action)
+        own = task.evaluate()
+        expected = task.compute_normalized_dense_reward(obs=None, action=torch.from_numpy(action)[None], info=own)
+        assert info["success"] == float(own["success"]) and reward == pytest.approx(float(expected), abs=1e-5)
+        found.append((float(info["success"]), float(reward)))
+    successes, rewards = zip(*found, strict=True)
+    assert not any(successes[:14]) and any(successes[14:]), "both values are compared"
+    assert max(rewards[:14]) < max(rewards[14:]) <= 1
+
+
+def test_hidden_shapes_come_back_to_the_table() -> None:
+    env = aib_repr.make_task(aib_repr.Args(env_id="RememberShapeAndColor3x2-v0"), 1)
+    env.reset(seed=5)
+    task, heights = env.unwrapped, []
+    for _ in range(20):
+        env.step(np.zeros(8, np.float32))
+        heights.append([float(x.pose.p[0, 2]) for x in task.shapes.values()])
+    env.close()
+    assert np.allclose(heights[10:], heights[-1], atol=2e-3) and 0 < np.min(heights[-1]) and np.max(heights[-1]) < 0.1

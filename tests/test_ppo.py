@@ -455,6 +455,7 @@ def test_table_5(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
         assert (args.env_id, args.total_timesteps, args.num_envs, args.update_epochs, args.gamma) == (task, *values)
         common = (args.learning_rate, args.gae_lambda, args.ent_coef, args.target_kl, args.num_minibatches)
         assert common == (1e-4, 0.9, 0.001, 0.05, 32)
+        assert (args.clip_coef, args.vf_coef, args.max_grad_norm) == (0.2, 0.5, 0.5)
     monkeypatch.setattr(sys, "argv", ["script", "--quick", "--env-id=RememberColor9-v0", "--gamma", "0.5"])
     args = module.parse_args()
     assert (args.num_envs, args.gamma, args.quick, args.exp_name) == (2, 0.5, True, f"{script}_quick")
