@@ -78,7 +78,7 @@ class Args:
     image_mask: float = 0.5
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
     occlusion: float = 0.5
-    """share of the episodes of which a rectangle is hidden from a random step on while the belief is trained"""
+    """share of the episodes in which the object is hidden from a random step on while the belief is trained"""
     warmup_updates: int = 0
     """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
     prior_nll: float = 0.0
@@ -197,7 +197,7 @@ class HistoryEncoder(nn.Module):
         self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
         self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
-        self.gru = nn.GRUCell(9 * (2 + 8) + 32, 256)
+        self.gru = nn.GRUCell(64 + 32, 256)
 
     def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 80), summary.
@@ -231,9 +231,9 @@ class HistoryEncoder(nn.Module):
         return place.squeeze(-2), log_weights.squeeze(-2)
 
     def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
-        """h (..., 256) of memory (..., 32), place and keypoints (..., 90) and joints (..., J)."""
+        """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
         arm = self.arm((joints - self.joints_mean) / self.joints_std)
-        return self.out(torch.cat([memory, self.place(places)], -1)) + arm
+        return self.out(torch.cat([memory, places], -1)) + arm
 
     def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
@@ -241,7 +241,7 @@ class HistoryEncoder(nn.Module):
             hidden = joints.new_zeros(len(rgb), 256)
         keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
-        places = torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1)
+        places = self.place(torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1))
         return self.combine(memory, places, joints), self.gru(torch.cat([places, summary], -1), hidden)
 
 
@@ -281,7 +281,7 @@ def chrono_init(gru: nn.GRUCell, steps: int) -> None:
 class AIBBelief(nn.Module):
     """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2).
 
-    config: image_shape [H, W, 3], joints_dim, state_dim, u_dim, z_dim.
+    config: image_shape [H, W, 3], joints_dim, u_dim, z_dim.
     """
 
     def __init__(self, config: dict):
@@ -290,7 +290,6 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss; only PPO's evaluations use it
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
@@ -316,13 +315,13 @@ def encode_history(
     hidden, memories, places = batch["joints"].new_zeros(keys.shape[1], 256), [], []
     for *patches, points, features in zip(keys, contents, keypoints, summary, strict=True):
         memories.append(history.code(hidden))
-        places.append(torch.cat([history.ask(memories[-1], *patches)[0], points], -1))
+        places.append(history.place(torch.cat([history.ask(memories[-1], *patches)[0], points], -1)))
         hidden = history.gru(torch.cat([places[-1], features], -1), hidden)
     memory, places = torch.stack(memories), torch.stack(places)
     if teacher_memory is None:
         return history.combine(memory, places, batch["joints"]), memory
     taught = torch.cat([teacher_memory, memory[..., 16:]], -1)
-    places = torch.cat([history.ask(taught, keys, contents)[0], keypoints], -1)
+    places = history.place(torch.cat([history.ask(taught, keys, contents)[0], keypoints], -1))
     return history.combine(taught, places, batch["joints"]), memory
 
 
@@ -341,7 +340,7 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     losses = {"error": 0.0}
     # all that is known, then the place alone and keypoints alone: else nobody looks for what the memory knows
     for knows_memory, knows_place, knows_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
-        places = torch.cat([knows_place * place, knows_keypoints * keypoints], -1)
+        places = history.place(torch.cat([knows_place * place, knows_keypoints * keypoints], -1))
         h = history.combine(knows_memory * memory, places, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
         losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
@@ -352,6 +351,29 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
     losses["total"] = sum(losses.values())
     return losses
+
+
+@torch.no_grad()
+def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, rng: np.random.Generator) -> None:
+    """In a share of episodes hide, from a random step on, the place that the teacher asks for, as the arm hides objects.
+
+    Changes rgb (T+1, B, H, W, 3): a rectangle of one colour, as wide and high as a quarter to a half of the picture.
+    """
+    rgb, history = batch["rgb"], model["belief"].history
+    episodes = np.flatnonzero(rng.random(rgb.shape[1]) < share)
+    if not len(episodes):
+        return
+    t = rng.integers(len(rgb), size=len(episodes))
+    memory = model["teacher"](batch["u"][0, episodes], torch.from_numpy(t).to(rgb.device))
+    keys, contents, *_ = history.look(rgb[t, episodes])
+    place, _ = history.ask(memory, keys, contents)
+    size = np.array(rgb.shape[2:4])
+    centres = (place[:, :2].cpu().numpy() + 1) / 2 * size
+    for step, episode, centre in zip(t, episodes, centres, strict=True):
+        half = rng.integers(size // 8, size // 4)
+        (top, left), (bottom, right) = (centre - half).clip(0).astype(int), (centre + half).astype(int)
+        colour = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
+        rgb[step:, episode, top:bottom, left:right] = colour
 
 
 def history_losses(
@@ -426,16 +448,6 @@ def belief_losses(
 
 
 # ---------------------------------------------------------------- data
-
-
-def hide_rectangles(rgb: Tensor, share: float, rng: np.random.Generator) -> None:
-    """In a share of episodes (T+1, B, H, W, 3) hide a rectangle from a random step on, as the arm hides objects."""
-    steps, episodes, height, width, _ = rgb.shape
-    for episode in np.flatnonzero(rng.random(episodes) < share):
-        t, size = rng.integers(steps), rng.integers((height // 4, width // 4), (height // 2, width // 2))
-        (top, left), (bottom, right) = (corner := rng.integers((height, width) - size)), corner + size
-        colour = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
-        rgb[t:, episode, top:bottom, left:right] = colour
 
 
 class EpisodeDataset:
@@ -521,7 +533,6 @@ def main(args: Args) -> None:
     config = {
         "image_shape": list(sample["rgb"].shape[2:]),
         "joints_dim": sample["joints"].shape[-1],
-        "state_dim": len(stored["phi"]["mean"]),
         "u_dim": stored["u_dim"],
         "z_dim": args.z_dim,
     }
@@ -533,7 +544,6 @@ def main(args: Args) -> None:
     if args.action_head != "none":
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
         model["head"] = mlp([inputs, 256, action_dim])
-    model["belief"].phi.load_state_dict(stored["phi"])
     history = model["belief"].history
     chrono_init(history.gru, len(sample["actions"]))
     for name in ("image_mean", "image_std", "joints_mean", "joints_std"):
@@ -566,7 +576,7 @@ def main(args: Args) -> None:
             losses = warmup_losses(model, frames, args)
         else:
             batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
-            hide_rectangles(batch["rgb"], args.occlusion, rng)
+            hide_objects(model, batch, args.occlusion, rng)
             losses = belief_losses(model, batch, args, teacher_acts=progress < 0.5)
         optimizer.zero_grad()
         losses["total"].backward()

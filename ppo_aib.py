@@ -225,19 +225,6 @@ class NatureCNN(nn.Module):
             return self.out(self.conv(images.permute(0, 3, 1, 2))).float()
 
 
-class StateEncoder(nn.Module):
-    """phi: privileged state (..., D), standardised inside, -> Normal over u (..., u_dim) (paper 3.1)."""
-
-    def __init__(self, state_dim: int, u_dim: int):
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(state_dim))
-        self.register_buffer("std", torch.ones(state_dim))
-        self.net = GaussianMLP(state_dim, [256, 256], u_dim, min_std=1e-5)
-
-    def forward(self, state: Tensor) -> Normal:
-        return self.net((state - self.mean) / self.std)
-
-
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
 
@@ -267,7 +254,7 @@ class HistoryEncoder(nn.Module):
         self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
         self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
-        self.gru = nn.GRUCell(9 * (2 + 8) + 32, 256)
+        self.gru = nn.GRUCell(64 + 32, 256)
 
     def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 80), summary.
@@ -301,9 +288,9 @@ class HistoryEncoder(nn.Module):
         return place.squeeze(-2), log_weights.squeeze(-2)
 
     def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
-        """h (..., 256) of memory (..., 32), place and keypoints (..., 90) and joints (..., J)."""
+        """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
         arm = self.arm((joints - self.joints_mean) / self.joints_std)
-        return self.out(torch.cat([memory, self.place(places)], -1)) + arm
+        return self.out(torch.cat([memory, places], -1)) + arm
 
     def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
@@ -311,14 +298,14 @@ class HistoryEncoder(nn.Module):
             hidden = joints.new_zeros(len(rgb), 256)
         keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
-        places = torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1)
+        places = self.place(torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1))
         return self.combine(memory, places, joints), self.gru(torch.cat([places, summary], -1), hidden)
 
 
 class AIBBelief(nn.Module):
     """b(h): history encoder, learned prior p(z|h) and decoder p(u|z,h) (paper 3.2).
 
-    config: image_shape [H, W, 3], joints_dim, state_dim, u_dim, z_dim.
+    config: image_shape [H, W, 3], joints_dim, u_dim, z_dim.
     """
 
     def __init__(self, config: dict):
@@ -327,7 +314,6 @@ class AIBBelief(nn.Module):
         self.history = HistoryEncoder(config)
         self.prior = GaussianMLP(256, [256], config["z_dim"], min_std=0.1)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss; only PPO's evaluations use it
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """p(u|z_i,h) for n samples z_i ~ p(z|h): h (..., 256), z_noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
@@ -419,50 +405,51 @@ def rollout(
 ) -> dict[str, Tensor]:
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
-    Episodes are played in rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the size
-    of a round changes results by rounding only.
-    Returns tensors (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; if deterministic
-    also the privileged state, for the evaluation of the belief; and values (T+1, N), V(o_T) last.
+    Episodes are played in rounds of envs.num_envs. Noise is drawn for each episode before any is played, so results do
+    not depend on how many run at once.
+    Returns tensors (T, N, ...), as declared below, and values (T+1, N) with V(o_T) as the last.
     """
-    num_episodes = len(seeds)
-    steps = gym.spec(args.env_id).max_episode_steps
-    device = args.device
-    (action_dim,) = envs.single_action_space.shape
+    steps, num_episodes, device = gym.spec(args.env_id).max_episode_steps, len(seeds), args.device
+    spaces, (action_dim,) = envs.single_observation_space, envs.single_action_space.shape
+    buffer = {
+        "rgb": torch.empty(steps, num_episodes, *spaces["rgb"].shape, dtype=torch.uint8, device=device),
+        "joints": torch.empty(steps, num_episodes, *spaces["joints"].shape, device=device),
+        "particles": torch.empty(steps, num_episodes, args.num_particles, agent.belief.config["u_dim"], device=device),
+        "actions": torch.empty(steps, num_episodes, action_dim, device=device),
+        "logprobs": torch.empty(steps, num_episodes, device=device),
+        "rewards": torch.empty(steps, num_episodes, device=device),
+        "success": torch.empty(steps, num_episodes, device=device),
+        "values": torch.empty(steps + 1, num_episodes, device=device),
+    }
     noise = colored_noise(args.noise_beta, (num_episodes, action_dim, steps), np.random.default_rng(seeds))
     noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
     shape = (steps + 1, num_episodes, args.num_particles)
     z_noise = torch.randn(*shape, agent.belief.config["z_dim"], device=device)
     u_noise = torch.randn(*shape, agent.belief.config["u_dim"], device=device)
-    buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     desc = "evaluation" if deterministic else "rollout"
     for first in range(0, num_episodes, envs.num_envs):
+        last = min(first + envs.num_envs, num_episodes)
         # the last round is filled up with repeated episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
-        kept = rows[: num_episodes - first]
-        obs, info = envs.reset(seed=seeds[rows].tolist())
+        obs, _ = envs.reset(seed=seeds[rows].tolist())
         hidden = None
         for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
-            step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
-            h, hidden = agent.belief.history(step["rgb"], step["joints"], hidden)
+            transition = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
+            h, hidden = agent.belief.history(transition["rgb"], transition["joints"], hidden)
             p_u = agent.belief.decode(h, z_noise[t, rows])
             # kept for the update: fresh particles would change its probability ratio
-            step["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
-            dist, values = agent(step)
-            buffer["values"][t, kept] = values[: len(kept)]
+            transition["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
+            dist, values = agent(transition)
+            buffer["values"][t, first:last] = values[: last - first]
             if t == steps:
                 break  # the last observation is only for its value
-            step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            # of the action before clamping; as if steps were independent, although coloured noise is correlated
-            step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
-            if deterministic:
-                step["state"] = torch.as_tensor(info["state"], dtype=torch.float32, device=device)
-            obs, rewards, _, _, info = envs.step(step["actions"].clamp(-1, 1).cpu().numpy())
-            step["rewards"] = torch.as_tensor(rewards, dtype=torch.float32, device=device)
-            step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
-            for name, value in step.items():
-                if name not in buffer:
-                    buffer[name] = value.new_empty(steps, num_episodes, *value.shape[1:])
-                buffer[name][t, kept] = value[: len(kept)]
+            actions = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
+            # before clamping; PPO ignores that coloured noise is correlated in time
+            transition |= {"actions": actions, "logprobs": dist.log_prob(actions).sum(-1)}
+            obs, rewards, _, _, info = envs.step(actions.clamp(-1, 1).cpu().numpy())
+            transition |= {"rewards": torch.as_tensor(rewards), "success": torch.as_tensor(info["success"])}
+            for name, x in transition.items():
+                buffer[name][t, first:last] = x[: last - first]
     return buffer
 
 
@@ -501,26 +488,13 @@ def make_video(buffer: dict[str, Tensor]) -> bytes:
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1, output_params=size)
 
 
-def r_squared(u: Tensor, estimate: Tensor) -> float:
-    """R2 of u (M, u_dim) from its estimate: 1 if that is u, 0 if it is no better than the mean of u."""
-    return 1 - ((u - estimate).square().sum() / (u - u.mean(0)).square().sum()).item()
-
-
-@torch.no_grad()
 def evaluate(
     envs: gym.vector.VectorEnv, agent: Agent, args: Args, first_seed: int = EVAL_SEED
 ) -> tuple[dict[str, float], bytes]:
-    """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
-
-    u_r2, u_r2_at_end: R2 of u = phi(s) from the mean particle, over all steps and before the last action.
-    """
+    """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time."""
     torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
-    u, estimate = agent.belief.phi(buffer["state"]).mean, buffer["particles"].mean(-2)
-    metrics = success_and_return(buffer)
-    metrics["u_r2"] = r_squared(u.flatten(0, 1), estimate.flatten(0, 1))
-    metrics["u_r2_at_end"] = r_squared(u[-1], estimate[-1])
-    return metrics, make_video(buffer)
+    return success_and_return(buffer), make_video(buffer)
 
 
 # ---------------------------------------------------------------- training

@@ -269,39 +269,42 @@ def rollout(
 ) -> dict[str, Tensor]:
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
-    Episodes are played in rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the size
-    of a round changes results by rounding only.
-    Returns tensors (T, N, ...): rgb uint8, joints, actions, logprobs, rewards, success; values (T+1, N), V(o_T) last.
+    Episodes are played in rounds of envs.num_envs. Noise is drawn for each episode before any is played, so results do
+    not depend on how many run at once.
+    Returns tensors (T, N, ...), as declared below, and values (T+1, N) with V(o_T) as the last.
     """
-    num_episodes = len(seeds)
-    steps = gym.spec(args.env_id).max_episode_steps
-    device = args.device
-    (action_dim,) = envs.single_action_space.shape
+    steps, num_episodes, device = gym.spec(args.env_id).max_episode_steps, len(seeds), args.device
+    spaces, (action_dim,) = envs.single_observation_space, envs.single_action_space.shape
+    buffer = {
+        "rgb": torch.empty(steps, num_episodes, *spaces["rgb"].shape, dtype=torch.uint8, device=device),
+        "joints": torch.empty(steps, num_episodes, *spaces["joints"].shape, device=device),
+        "actions": torch.empty(steps, num_episodes, action_dim, device=device),
+        "logprobs": torch.empty(steps, num_episodes, device=device),
+        "rewards": torch.empty(steps, num_episodes, device=device),
+        "success": torch.empty(steps, num_episodes, device=device),
+        "values": torch.empty(steps + 1, num_episodes, device=device),
+    }
     noise = colored_noise(args.noise_beta, (num_episodes, action_dim, steps), np.random.default_rng(seeds))
     noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
-    buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     desc = "evaluation" if deterministic else "rollout"
     for first in range(0, num_episodes, envs.num_envs):
+        last = min(first + envs.num_envs, num_episodes)
         # the last round is filled up with repeated episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
-        kept = rows[: num_episodes - first]
-        obs, info = envs.reset(seed=seeds[rows].tolist())
+        obs, _ = envs.reset(seed=seeds[rows].tolist())
         for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
-            step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
-            dist, values = agent(step)
-            buffer["values"][t, kept] = values[: len(kept)]
+            transition = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
+            dist, values = agent(transition)
+            buffer["values"][t, first:last] = values[: last - first]
             if t == steps:
                 break  # the last observation is only for its value
-            step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            # of the action before clamping; as if steps were independent, although coloured noise is correlated
-            step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
-            obs, rewards, _, _, info = envs.step(step["actions"].clamp(-1, 1).cpu().numpy())
-            step["rewards"] = torch.as_tensor(rewards, dtype=torch.float32, device=device)
-            step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
-            for name, value in step.items():
-                if name not in buffer:
-                    buffer[name] = value.new_empty(steps, num_episodes, *value.shape[1:])
-                buffer[name][t, kept] = value[: len(kept)]
+            actions = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
+            # before clamping; PPO ignores that coloured noise is correlated in time
+            transition |= {"actions": actions, "logprobs": dist.log_prob(actions).sum(-1)}
+            obs, rewards, _, _, info = envs.step(actions.clamp(-1, 1).cpu().numpy())
+            transition |= {"rewards": torch.as_tensor(rewards), "success": torch.as_tensor(info["success"])}
+            for name, x in transition.items():
+                buffer[name][t, first:last] = x[: last - first]
     return buffer
 
 
@@ -331,6 +334,7 @@ def evaluate(
     envs: gym.vector.VectorEnv, agent: Agent, args: Args, first_seed: int = EVAL_SEED
 ) -> tuple[dict[str, float], bytes]:
     """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time."""
+    torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
     return success_and_return(buffer), make_video(buffer)
 

@@ -100,7 +100,7 @@ class Args:
     image_mask: float = 0.5
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
     occlusion: float = 0.5
-    """share of the episodes of which a rectangle is hidden from a random step on while the belief is trained"""
+    """share of the episodes in which the object is hidden from a random step on while the belief is trained"""
     warmup_updates: int = 0
     """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
     prior_nll: float = 0.0
@@ -294,7 +294,7 @@ class HistoryEncoder(nn.Module):
         self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
         self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
-        self.gru = nn.GRUCell(9 * (2 + 8) + 32, 256)
+        self.gru = nn.GRUCell(64 + 32, 256)
 
     def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 80), summary.
@@ -328,9 +328,9 @@ class HistoryEncoder(nn.Module):
         return place.squeeze(-2), log_weights.squeeze(-2)
 
     def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
-        """h (..., 256) of memory (..., 32), place and keypoints (..., 90) and joints (..., J)."""
+        """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
         arm = self.arm((joints - self.joints_mean) / self.joints_std)
-        return self.out(torch.cat([memory, self.place(places)], -1)) + arm
+        return self.out(torch.cat([memory, places], -1)) + arm
 
     def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
@@ -338,7 +338,7 @@ class HistoryEncoder(nn.Module):
             hidden = joints.new_zeros(len(rgb), 256)
         keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
-        places = torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1)
+        places = self.place(torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1))
         return self.combine(memory, places, joints), self.gru(torch.cat([places, summary], -1), hidden)
 
 
@@ -378,7 +378,7 @@ def chrono_init(gru: nn.GRUCell, steps: int) -> None:
 class BelieverBelief(nn.Module):
     """b(h) of Believer: history encoder, fixed prior N(0, I) and decoder p(u|z,h).
 
-    config: image_shape [H, W, 3], joints_dim, state_dim, u_dim, z_dim.
+    config: image_shape [H, W, 3], joints_dim, u_dim, z_dim.
     """
 
     def __init__(self, config: dict):
@@ -386,7 +386,6 @@ class BelieverBelief(nn.Module):
         self.config = config
         self.history = HistoryEncoder(config)
         self.decoder = GaussianMLP(config["z_dim"] + 256, [256, 256], config["u_dim"], min_std=0.1)
-        self.phi = StateEncoder(config["state_dim"], config["u_dim"])  # in no loss; only PPO's evaluations use it
 
     def decode(self, h: Tensor, z_noise: Tensor) -> Normal:
         """Give p(u|z_i,h) of z_i ~ N(0, I), i = 1..n: h (..., 256), noise (..., n, z_dim) -> Normal (..., n, u_dim)."""
@@ -439,13 +438,13 @@ def encode_history(
     hidden, memories, places = batch["joints"].new_zeros(keys.shape[1], 256), [], []
     for *patches, points, features in zip(keys, contents, keypoints, summary, strict=True):
         memories.append(history.code(hidden))
-        places.append(torch.cat([history.ask(memories[-1], *patches)[0], points], -1))
+        places.append(history.place(torch.cat([history.ask(memories[-1], *patches)[0], points], -1)))
         hidden = history.gru(torch.cat([places[-1], features], -1), hidden)
     memory, places = torch.stack(memories), torch.stack(places)
     if teacher_memory is None:
         return history.combine(memory, places, batch["joints"]), memory
     taught = torch.cat([teacher_memory, memory[..., 16:]], -1)
-    places = torch.cat([history.ask(taught, keys, contents)[0], keypoints], -1)
+    places = history.place(torch.cat([history.ask(taught, keys, contents)[0], keypoints], -1))
     return history.combine(taught, places, batch["joints"]), memory
 
 
@@ -464,7 +463,7 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     losses = {"error": 0.0}
     # all that is known, then the place alone and keypoints alone: else nobody looks for what the memory knows
     for knows_memory, knows_place, knows_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
-        places = torch.cat([knows_place * place, knows_keypoints * keypoints], -1)
+        places = history.place(torch.cat([knows_place * place, knows_keypoints * keypoints], -1))
         h = history.combine(knows_memory * memory, places, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
         losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
@@ -475,6 +474,29 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
     losses["total"] = sum(losses.values())
     return losses
+
+
+@torch.no_grad()
+def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, rng: np.random.Generator) -> None:
+    """In a share of episodes hide, from a random step on, the place that the teacher asks for, as the arm hides objects.
+
+    Changes rgb (T+1, B, H, W, 3): a rectangle of one colour, as wide and high as a quarter to a half of the picture.
+    """
+    rgb, history = batch["rgb"], model["belief"].history
+    episodes = np.flatnonzero(rng.random(rgb.shape[1]) < share)
+    if not len(episodes):
+        return
+    t = rng.integers(len(rgb), size=len(episodes))
+    memory = model["teacher"](batch["u"][0, episodes], torch.from_numpy(t).to(rgb.device))
+    keys, contents, *_ = history.look(rgb[t, episodes])
+    place, _ = history.ask(memory, keys, contents)
+    size = np.array(rgb.shape[2:4])
+    centres = (place[:, :2].cpu().numpy() + 1) / 2 * size
+    for step, episode, centre in zip(t, episodes, centres, strict=True):
+        half = rng.integers(size // 8, size // 4)
+        (top, left), (bottom, right) = (centre - half).clip(0).astype(int), (centre + half).astype(int)
+        colour = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
+        rgb[step:, episode, top:bottom, left:right] = colour
 
 
 def history_losses(
@@ -550,16 +572,6 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
 # ---------------------------------------------------------------- data
 
 
-def hide_rectangles(rgb: Tensor, share: float, rng: np.random.Generator) -> None:
-    """In a share of episodes (T+1, B, H, W, 3) hide a rectangle from a random step on, as the arm hides objects."""
-    steps, episodes, height, width, _ = rgb.shape
-    for episode in np.flatnonzero(rng.random(episodes) < share):
-        t, size = rng.integers(steps), rng.integers((height // 4, width // 4), (height // 2, width // 2))
-        (top, left), (bottom, right) = (corner := rng.integers((height, width) - size)), corner + size
-        colour = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
-        rgb[t:, episode, top:bottom, left:right] = colour
-
-
 class EpisodeDataset:
     """Whole episodes of dataset/ and their u (N, T+1, u_dim), on the disk, or on the GPU where they fit there."""
 
@@ -613,50 +625,51 @@ def rollout(
 ) -> dict[str, Tensor]:
     """Play one whole episode per seed; deterministic actions are the policy's means.
 
-    Episodes are played in rounds of envs.num_envs; all noise is drawn before the first, so that on physx_cpu the size
-    of a round changes results by rounding only.
-    Returns tensors (T, N, ...): rgb uint8, joints, particles, actions, logprobs, rewards, success; if deterministic
-    also the privileged state, for the evaluation of the belief; and values (T+1, N), V(o_T) last.
+    Episodes are played in rounds of envs.num_envs. Noise is drawn for each episode before any is played, so results do
+    not depend on how many run at once.
+    Returns tensors (T, N, ...), as declared below, and values (T+1, N) with V(o_T) as the last.
     """
-    num_episodes = len(seeds)
-    steps = gym.spec(args.env_id).max_episode_steps
-    device = args.device
-    (action_dim,) = envs.single_action_space.shape
+    steps, num_episodes, device = gym.spec(args.env_id).max_episode_steps, len(seeds), args.device
+    spaces, (action_dim,) = envs.single_observation_space, envs.single_action_space.shape
+    buffer = {
+        "rgb": torch.empty(steps, num_episodes, *spaces["rgb"].shape, dtype=torch.uint8, device=device),
+        "joints": torch.empty(steps, num_episodes, *spaces["joints"].shape, device=device),
+        "particles": torch.empty(steps, num_episodes, args.num_particles, agent.belief.config["u_dim"], device=device),
+        "actions": torch.empty(steps, num_episodes, action_dim, device=device),
+        "logprobs": torch.empty(steps, num_episodes, device=device),
+        "rewards": torch.empty(steps, num_episodes, device=device),
+        "success": torch.empty(steps, num_episodes, device=device),
+        "values": torch.empty(steps + 1, num_episodes, device=device),
+    }
     noise = colored_noise(args.noise_beta, (num_episodes, action_dim, steps), np.random.default_rng(seeds))
     noise = torch.from_numpy(noise.transpose(2, 0, 1)).float().to(device)
     shape = (steps + 1, num_episodes, args.num_particles)
     z_noise = torch.randn(*shape, agent.belief.config["z_dim"], device=device)
     u_noise = torch.randn(*shape, agent.belief.config["u_dim"], device=device)
-    buffer = {"values": torch.empty(steps + 1, num_episodes, device=device)}
     desc = "evaluation" if deterministic else "rollout"
     for first in range(0, num_episodes, envs.num_envs):
+        last = min(first + envs.num_envs, num_episodes)
         # the last round is filled up with repeated episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
-        kept = rows[: num_episodes - first]
-        obs, info = envs.reset(seed=seeds[rows].tolist())
+        obs, _ = envs.reset(seed=seeds[rows].tolist())
         hidden = None
         for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
-            step = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
-            h, hidden = agent.belief.history(step["rgb"], step["joints"], hidden)
+            transition = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
+            h, hidden = agent.belief.history(transition["rgb"], transition["joints"], hidden)
             p_u = agent.belief.decode(h, z_noise[t, rows])
             # kept for the update: fresh particles would change its probability ratio
-            step["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
-            dist, values = agent(step)
-            buffer["values"][t, kept] = values[: len(kept)]
+            transition["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
+            dist, values = agent(transition)
+            buffer["values"][t, first:last] = values[: last - first]
             if t == steps:
                 break  # the last observation is only for its value
-            step["actions"] = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            # of the action before clamping; as if steps were independent, although coloured noise is correlated
-            step["logprobs"] = dist.log_prob(step["actions"]).sum(-1)
-            if deterministic:
-                step["state"] = torch.as_tensor(info["state"], dtype=torch.float32, device=device)
-            obs, rewards, _, _, info = envs.step(step["actions"].clamp(-1, 1).cpu().numpy())
-            step["rewards"] = torch.as_tensor(rewards, dtype=torch.float32, device=device)
-            step["success"] = torch.as_tensor(info["success"], dtype=torch.float32, device=device)
-            for name, value in step.items():
-                if name not in buffer:
-                    buffer[name] = value.new_empty(steps, num_episodes, *value.shape[1:])
-                buffer[name][t, kept] = value[: len(kept)]
+            actions = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
+            # before clamping; PPO ignores that coloured noise is correlated in time
+            transition |= {"actions": actions, "logprobs": dist.log_prob(actions).sum(-1)}
+            obs, rewards, _, _, info = envs.step(actions.clamp(-1, 1).cpu().numpy())
+            transition |= {"rewards": torch.as_tensor(rewards), "success": torch.as_tensor(info["success"])}
+            for name, x in transition.items():
+                buffer[name][t, first:last] = x[: last - first]
     return buffer
 
 
@@ -705,21 +718,13 @@ def r_squared(u: Tensor, estimate: Tensor) -> float:
     return 1 - ((u - estimate).square().sum() / (u - u.mean(0)).square().sum()).item()
 
 
-@torch.no_grad()
 def evaluate(
     envs: gym.vector.VectorEnv, agent: Agent, args: Args, first_seed: int = EVAL_SEED
 ) -> tuple[dict[str, float], bytes]:
-    """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time.
-
-    u_r2, u_r2_at_end: R2 of u = phi(s) from the mean particle, over all steps and before the last action.
-    """
+    """Metrics and video of args.num_eval_episodes episodes with mean actions, the same episodes every time."""
     torch.manual_seed(0)  # the same noise at every evaluation; main seeds each iteration anew
     buffer = rollout(envs, agent, args, first_seed + np.arange(args.num_eval_episodes), deterministic=True)
-    u, estimate = agent.belief.phi(buffer["state"]).mean, buffer["particles"].mean(-2)
-    metrics = success_and_return(buffer)
-    metrics["u_r2"] = r_squared(u.flatten(0, 1), estimate.flatten(0, 1))
-    metrics["u_r2_at_end"] = r_squared(u[-1], estimate[-1])
-    return metrics, make_video(buffer)
+    return success_and_return(buffer), make_video(buffer)
 
 
 # ---------------------------------------------------------------- training
@@ -735,7 +740,6 @@ def train_belief(args: Args, path: Path) -> None:
     config = {
         "image_shape": list(sample["rgb"].shape[2:]),
         "joints_dim": sample["joints"].shape[-1],
-        "state_dim": len(stored["phi"]["mean"]),
         "u_dim": stored["u_dim"],
         "z_dim": args.z_dim,
     }
@@ -743,7 +747,6 @@ def train_belief(args: Args, path: Path) -> None:
     model = nn.ModuleDict({"belief": BelieverBelief(config)})
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     model["teacher"], model["locator"] = Teacher(config["u_dim"]), Locator(config["u_dim"])
-    model["belief"].phi.load_state_dict(stored["phi"])
     history = model["belief"].history
     chrono_init(history.gru, len(sample["actions"]))
     for name in ("image_mean", "image_std", "joints_mean", "joints_std"):
@@ -776,7 +779,7 @@ def train_belief(args: Args, path: Path) -> None:
             losses = warmup_losses(model, frames, args)
         else:
             batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
-            hide_rectangles(batch["rgb"], args.occlusion, rng)
+            hide_objects(model, batch, args.occlusion, rng)
             losses = believer_losses(model, batch, args, teacher_acts=progress < 0.5)
         optimizer.zero_grad()
         losses["total"].backward()

@@ -79,9 +79,6 @@ def test_the_last_episodes_are_held_out_and_the_last_weights_kept(
     assert [episodes for episodes, _ in looks] == [held_out] * 3
     stored = torch.load(path / "belief.pt", weights_only=True)
     phi = torch.load(Path(repr_dir) / "repr.pt", weights_only=True)["phi"]
-    assert all(torch.equal(stored["belief"][f"phi.{name}"], x) for name, x in phi.items()), (
-        "PPO's evaluation needs it for u"
-    )
     state = torch.from_numpy(np.load(Path(repr_dir) / "dataset" / "state.npy")[held_out])
     encoder = aib_belief.StateEncoder(4, 16)
     encoder.load_state_dict(phi)
@@ -113,7 +110,6 @@ def test_believers_belief_gets_the_episodes_phi_and_statistics_of_aibs(
     assert [index for index in read if 16 in index] == [[16, 17, 18, 19]]
     belief = torch.load(path / "belief.pt", weights_only=True)["belief"]
     stage_1 = torch.load(repr_dir / "repr.pt", weights_only=True)
-    assert all(torch.equal(belief[f"phi.{name}"], x) for name, x in stage_1["phi"].items())
     assert all(torch.equal(belief[f"history.{name}"], stage_1["norm"][name]) for name in stage_1["norm"])
 
 
@@ -216,4 +212,3 @@ def test_everything_learns_with_clipped_gradients_and_floors_of_the_deviations(
         parts += ["belief.prior.net.0.weight", "head.0.weight"]
     for part in parts:
         assert not torch.equal(models[0][part], models[1][part]), part
-    assert torch.equal(models[0]["belief.phi.net.net.0.weight"], models[1]["belief.phi.net.net.0.weight"]), "frozen"

@@ -20,7 +20,7 @@ import toy
 from conftest import TOY, spaces
 
 IMAGE, J, A, U, T, B = [36, 36, 3], 3, 2, 4, 10, 3
-CONFIG = {"image_shape": IMAGE, "joints_dim": J, "state_dim": 7, "u_dim": U, "z_dim": 5}
+CONFIG = {"image_shape": IMAGE, "joints_dim": J, "u_dim": U, "z_dim": 5}
 
 
 @pytest.fixture(autouse=True)

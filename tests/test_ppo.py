@@ -17,7 +17,10 @@ import ppo_aib
 import ppo_baseline
 import ppo_believer
 import toy
-from conftest import SCRIPTS, TOY, train
+from conftest import ROOT, SCRIPTS, TOY, train
+
+sys.path.append(str(ROOT / "benchmark"))
+import diagnose_agent  # noqa: E402
 
 METHODS = ["ppo_aib", "ppo_believer", "ppo_baseline"]
 SMALL = dict(total_timesteps=160, num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=6, num_workers=3)
@@ -147,46 +150,36 @@ def test_particle_noise_is_the_decoders(toy_stages: Path) -> None:
     assert particles.std(1).mean() > 0.5, "the decoder's std is still about softplus(0) + 0.1, that of its means 0.1"
 
 
-@pytest.mark.parametrize("script", ["ppo_aib", "ppo_believer"])
-def test_u_r2_tells_what_the_belief_knows_of_the_episodes_just_played(
-    toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
-) -> None:
-    """The agent's particles are replaced by ones that are u but for known noise; the true u is that of the seeds."""
-    module, arguments = SCRIPTS[script], small(SCRIPTS[script], toy_stages, num_eval_episodes=16)
-    args = module.Args(env_id=TOY, **arguments)
-    stored = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)
-    belief = (ppo_aib.AIBBelief if script == "ppo_aib" else ppo_believer.BelieverBelief)(stored["config"])
-    phi = {name.removeprefix("phi."): x for name, x in stored["belief"].items() if name.startswith("phi.")}
-    belief.phi.load_state_dict(phi)
-    played, rollout = [], module.rollout
-
-    def informed(*arguments: object, deterministic: bool) -> dict[str, torch.Tensor]:
-        data = rollout(*arguments, deterministic=deterministic)
-        u = belief.phi(data["state"]).mean
-        error = size * (u - u.mean((0, 1))).square().mean((0, 1)).sqrt() * torch.randn_like(u)
-        played.append(data)
-        return {**data, "particles": (u + error)[:, :, None].expand(-1, -1, 30, -1)}
-
-    monkeypatch.setattr(module, "rollout", informed)
-    agent = module.Agent(toy.ToyMemory(1), belief, args)
-    for size, expected in ((0.0, 1.0), (0.5**0.5, 0.5)):  # noqa: B007  (informed reads it)
-        metrics, _ = module.evaluate(toy.make_envs(args), agent, args)
-        assert metrics["u_r2"] == pytest.approx(expected, abs=0.1)
-    assert torch.equal(played[0]["particles"], played[1]["particles"]), "the same noise at every evaluation"
-    assert list(metrics)[-2:] == ["u_r2", "u_r2_at_end"] and metrics["u_r2_at_end"] < 1
-    envs = toy.make_envs(args)
-    for i in range(0, 16, 3):  # three episodes at a time, as the rollout plays them
-        _, info = envs.reset(seed=[module.EVAL_SEED + min(i + k, 15) for k in range(3)])
-        rows = slice(i, min(i + 3, 16))
-        assert np.array_equal(played[0]["state"][0, rows], info["state"][: rows.stop - i])
-    random = rollout(envs, agent, args, np.arange(3))
-    assert "state" not in random, "training does not see the privileged state"
+def test_u_r2_tells_what_the_belief_knows_of_the_episodes_just_played(toy_stages: Path) -> None:
+    """Particles that are u but for known noise; states are recorded as a rollout plays three episodes at a time."""
+    agent, _ = play(toy_stages)
+    args = ppo_aib.Args(env_id=TOY, **small(ppo_aib, toy_stages))
+    diagnose_agent.RecordState.rounds.clear()
+    envs = diagnose_agent.RecordState(toy.make_envs(args))
+    seeds = np.arange(16)
+    buffer = ppo_aib.rollout(envs, agent, args, seeds, deterministic=True)
+    phi = diagnose_agent.load_phi(toy_stages / f"{TOY}__aib_repr__1")
+    plain = toy.ToyMemory(16)
+    _, info = plain.reset(seed=seeds.tolist())
+    states = [info["state"]]
+    for action in buffer["actions"]:
+        *_, info = plain.step(action.clamp(-1, 1).numpy())
+        states.append(info["state"])
+    u = phi(torch.from_numpy(np.stack(states)[:-1]).float()).mean
+    scale = (u - u.mean(1, keepdim=True)).square().mean((1, 2), keepdim=True).sqrt()
+    for size, expected in ((0.0, 1.0), (0.5**0.5, 0.5)):
+        particles = u + size * scale * torch.randn_like(u)
+        metrics = diagnose_agent.diagnose({**buffer, "particles": particles[:, :, None].expand(-1, -1, 30, -1)}, phi)
+        assert list(metrics["u_r2"]) == [0, 5] and np.mean(list(metrics["u_r2"].values())) == pytest.approx(
+            expected, abs=0.15
+        )
+    diagnose_agent.RecordState.rounds.clear()
 
 
 def test_r_squared() -> None:
     u = torch.tensor([[0.0, 1.0], [2.0, 1.0], [4.0, 1.0]])
-    assert ppo_aib.r_squared(u, u) == 1 and ppo_aib.r_squared(u, u.mean(0).expand(3, 2)) == 0
-    assert ppo_aib.r_squared(u, u + 1) == pytest.approx(1 - 6 / 8)
+    assert aib_belief.r_squared(u, u) == 1 and aib_belief.r_squared(u, u.mean(0).expand(3, 2)) == 0
+    assert aib_belief.r_squared(u, u + 1) == pytest.approx(1 - 6 / 8)
 
 
 def test_exploration_noise_is_coloured_and_standard_normal_at_every_step() -> None:
