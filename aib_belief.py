@@ -355,7 +355,7 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
 
 @torch.no_grad()
 def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, rng: np.random.Generator) -> None:
-    """In a share of episodes hide, from a random step on, the place that the teacher asks for, as the arm hides objects.
+    """In a share of episodes hide the place that the teacher asks for, from a random step on, as the arm hides objects.
 
     Changes rgb (T+1, B, H, W, 3): a rectangle of one colour, as wide and high as a quarter to a half of the picture.
     """
