@@ -17,6 +17,7 @@ import json
 import math
 import os
 import shutil
+import signal
 import sys
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -681,6 +682,7 @@ def load(path: Path, **expected: object) -> dict:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what a scheduler sends is a Ctrl-C, too
     try:
         main(parse_args())
     except KeyboardInterrupt:

@@ -634,7 +634,14 @@ def load(path: Path, **expected: object) -> dict:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what a scheduler sends is a Ctrl-C, too
     try:
         main(parse_args())
     except KeyboardInterrupt:
         sys.exit("\nstopped; the same command resumes the run from what was saved last")
+    except (EOFError, ConnectionError):  # of the pipe to a simulator
+        message = "a simulator process was killed, perhaps as memory ran out; the same command resumes the run"
+        print(f"error: {message}", file=sys.stderr, flush=True)
+        for worker in multiprocessing.active_children():
+            worker.kill()
+        os._exit(2)  # gymnasium would still talk to the dead process

@@ -9,6 +9,7 @@ import pytest
 from conftest import ROOT, SCRIPTS
 
 sys.path.append(str(ROOT / "benchmark"))
+import belief  # noqa: E402
 import diagnose_agent
 import experiments
 import report
@@ -21,7 +22,7 @@ OTHER_FLAGS = {"--no-index", "--color-words", "--logdir", "--help"}  # of git, T
 def known_flags() -> set[str]:
     """Every flag of the scripts and of the benchmark's commands, with --no- for what is true or false."""
     flags = set(OTHER_FLAGS)
-    for module in (*SCRIPTS.values(), diagnose_agent, experiments, report, true_state):
+    for module in (*SCRIPTS.values(), belief, diagnose_agent, experiments, report, true_state):
         for field in fields(module.Args):
             name = field.name.replace("_", "-")
             flags |= {f"--{name}", f"--no-{name}"}
