@@ -174,7 +174,8 @@ class HistoryEncoder(nn.Module):
 
     The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
     it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
-    Keypoints do the same for questions that are always the same ones, as the moving ball's place.
+    A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are attention
+    with questions that are always the same ones, as the moving ball's place.
     The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
@@ -195,6 +196,9 @@ class HistoryEncoder(nn.Module):
         self.point_queries = nn.Parameter(torch.randn(8, 16))
         self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
+        self.sure = nn.Linear(1, 1)  # starts as sigmoid(10 (largest weight - 0.4))
+        nn.init.constant_(self.sure.weight, 10.0)
+        nn.init.constant_(self.sure.bias, -4.0)
         self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
         self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
@@ -231,19 +235,30 @@ class HistoryEncoder(nn.Module):
         place, log_weights = self.attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
         return place.squeeze(-2), log_weights.squeeze(-2)
 
+    def keep(self, place: Tensor, log_weights: Tensor, before: Tensor) -> Tensor:
+        """The place (..., 10) as far as the attention, of weights (..., N), is sure of it; else the one before."""
+        sure = self.sure(log_weights.exp().amax(-1, keepdim=True)).sigmoid()
+        return before + sure * (place - before)
+
     def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
         """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
         arm = self.arm((joints - self.joints_mean) / self.joints_std)
         return self.out(torch.cat([memory, places], -1)) + arm
 
-    def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
-        if hidden is None:
-            hidden = joints.new_zeros(len(rgb), 256)
+    def forward(self, rgb: Tensor, joints: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """One step: rgb (B, H, W, 3) uint8, joints (B, J), state before (None: 0) -> h (B, 256), state after.
+
+        The state is the GRU's and the place, (B, 256 + 10).
+        """
+        if state is None:
+            state = joints.new_zeros(len(rgb), 256 + 10)
+        hidden, place = state.split([256, 10], -1)
         keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
-        places = self.place(torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1))
-        return self.combine(memory, places, joints), self.gru(torch.cat([places, summary], -1), hidden)
+        place = self.keep(*self.ask(memory, keys, contents), place)
+        places = self.place(torch.cat([place, keypoints], -1))
+        hidden = self.gru(torch.cat([places, summary], -1), hidden)
+        return self.combine(memory, places, joints), torch.cat([hidden, place], -1)
 
 
 class Teacher(nn.Module):
@@ -314,15 +329,20 @@ def encode_history(
         torch.cat(x).unflatten(0, batch["rgb"].shape[:2]) for x in zip(*seen, strict=True)
     )
     hidden, memories, places = batch["joints"].new_zeros(keys.shape[1], 256), [], []
+    place = start = batch["joints"].new_zeros(keys.shape[1], 10)
     for *patches, points, features in zip(keys, contents, keypoints, summary, strict=True):
         memories.append(history.code(hidden))
-        places.append(history.place(torch.cat([history.ask(memories[-1], *patches)[0], points], -1)))
+        place = history.keep(*history.ask(memories[-1], *patches), place)
+        places.append(history.place(torch.cat([place, points], -1)))
         hidden = history.gru(torch.cat([places[-1], features], -1), hidden)
     memory, places = torch.stack(memories), torch.stack(places)
     if teacher_memory is None:
         return history.combine(memory, places, batch["joints"]), memory
-    taught = torch.cat([teacher_memory, memory[..., 16:]], -1)
-    places = history.place(torch.cat([history.ask(taught, keys, contents)[0], keypoints], -1))
+    taught, place, kept = torch.cat([teacher_memory, memory[..., 16:]], -1), start, []
+    for found in zip(*history.ask(taught, keys, contents), strict=True):
+        place = history.keep(*found, place)
+        kept.append(place)
+    places = history.place(torch.cat([torch.stack(kept), keypoints], -1))
     return history.combine(taught, places, batch["joints"]), memory
 
 
@@ -382,7 +402,7 @@ def history_losses(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """h (T+1, B, 256) of whole episodes, and what trains it beside the ELBO; zeros where the arguments say so.
 
-    prior_nll: -log p(u|z,h) with z from the prior. memory: squared error of the memory from the teacher's.
+    prior_nll: -log p(u|z,h) with z from the prior. memory: 10 times its squared error from the teacher's.
     teacher_acts: h is of the teacher's memory, the GRU's own only follows it.
     """
     t = torch.arange(len(batch["u"]), device=batch["u"].device)
@@ -397,7 +417,7 @@ def history_losses(
         decoded = model["belief"].decode(h, torch.randn(*h.shape[:-1], 1, args.z_dim, device=h.device))
         losses["prior_nll"] = -decoded.log_prob(batch["u"].unsqueeze(-2)).sum(-1).mean()
     if args.warmup_updates:
-        losses["memory"] = (memory[..., :16] - teacher_memory).square().sum(-1).mean()
+        losses["memory"] = 10 * (memory[..., :16] - teacher_memory).square().sum(-1).mean()
     return h, losses
 
 

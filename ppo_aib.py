@@ -230,7 +230,8 @@ class HistoryEncoder(nn.Module):
 
     The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
     it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
-    Keypoints do the same for questions that are always the same ones, as the moving ball's place.
+    A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are attention
+    with questions that are always the same ones, as the moving ball's place.
     The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
     """
 
@@ -251,6 +252,9 @@ class HistoryEncoder(nn.Module):
         self.point_queries = nn.Parameter(torch.randn(8, 16))
         self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
+        self.sure = nn.Linear(1, 1)  # starts as sigmoid(10 (largest weight - 0.4))
+        nn.init.constant_(self.sure.weight, 10.0)
+        nn.init.constant_(self.sure.bias, -4.0)
         self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
         self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
@@ -287,19 +291,30 @@ class HistoryEncoder(nn.Module):
         place, log_weights = self.attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
         return place.squeeze(-2), log_weights.squeeze(-2)
 
+    def keep(self, place: Tensor, log_weights: Tensor, before: Tensor) -> Tensor:
+        """The place (..., 10) as far as the attention, of weights (..., N), is sure of it; else the one before."""
+        sure = self.sure(log_weights.exp().amax(-1, keepdim=True)).sigmoid()
+        return before + sure * (place - before)
+
     def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
         """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
         arm = self.arm((joints - self.joints_mean) / self.joints_std)
         return self.out(torch.cat([memory, places], -1)) + arm
 
-    def forward(self, rgb: Tensor, joints: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """One step: rgb (B, H, W, 3) uint8, joints (B, J), GRU state before (None: 0) -> h (B, 256), state after."""
-        if hidden is None:
-            hidden = joints.new_zeros(len(rgb), 256)
+    def forward(self, rgb: Tensor, joints: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """One step: rgb (B, H, W, 3) uint8, joints (B, J), state before (None: 0) -> h (B, 256), state after.
+
+        The state is the GRU's and the place, (B, 256 + 10).
+        """
+        if state is None:
+            state = joints.new_zeros(len(rgb), 256 + 10)
+        hidden, place = state.split([256, 10], -1)
         keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
-        places = self.place(torch.cat([self.ask(memory, keys, contents)[0], keypoints], -1))
-        return self.combine(memory, places, joints), self.gru(torch.cat([places, summary], -1), hidden)
+        place = self.keep(*self.ask(memory, keys, contents), place)
+        places = self.place(torch.cat([place, keypoints], -1))
+        hidden = self.gru(torch.cat([places, summary], -1), hidden)
+        return self.combine(memory, places, joints), torch.cat([hidden, place], -1)
 
 
 class AIBBelief(nn.Module):
