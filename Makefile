@@ -19,13 +19,13 @@ run: setup
 
 demo: setup
 	task="--env-id RememberColor3-v0 --small"
-	echo "AIB on RememberColor3-v0 in three stages, an estimated 35 minutes on two cores; stopped, make demo resumes it"
+	echo "AIB on RememberColor3-v0 in three stages, an estimated 45 minutes on two cores; stopped, make demo resumes it"
 	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 3 minutes"
 	$(PY) aib_repr.py $$task
-	echo "stage 2 of 3: the belief, an estimated 15 minutes"
+	echo "stage 2 of 3: the belief, an estimated 25 minutes"
 	$(PY) aib_belief.py $$task
 	echo "stage 3 of 3: PPO on observation and belief, about 14 minutes; curves: .venv/bin/tensorboard --logdir runs"
-	$(PY) ppo_aib.py $$task
+	$(PY) ppo_aib.py $$task --total-timesteps 120000
 	$(PY) benchmark/report.py --runs runs
 	echo "chance level of success_once: 0.33; plain PPO stays there"
 	echo "curve: benchmark/report/learning_curves.png; videos: $$(ls -d runs/RememberColor3-v0__ppo_aib_small__1/videos)"

@@ -54,7 +54,7 @@ class Args:
     device: Literal["cpu", "cuda"] = "cuda" if CUDA else "cpu"
     """where the networks live"""
     small: bool = False
-    """a reduced setting for a CPU, by estimate 40 minutes for all stages of RememberColor3-v0"""
+    """a reduced setting for a CPU: by estimate 2 hours for all stages of RememberColor3-v0 on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 
@@ -176,7 +176,7 @@ class HistoryEncoder(nn.Module):
     it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
     A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are attention
     with questions that are always the same ones, as the moving ball's place.
-    The paper's history (E.2) has past actions, too: left out, as h_{t+1} would show a_t, which AIB's head infers.
+    The paper's history (E.2) has past actions, too: left out, as joints show them (a_t from joints at t and t + 1).
     """
 
     def __init__(self, config: dict):

@@ -71,7 +71,7 @@ class Args:
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
     small: bool = False
-    """a reduced setting for a CPU, by estimate 40 minutes for all stages of RememberColor3-v0"""
+    """a reduced setting for a CPU: by estimate 2 hours for all stages of RememberColor3-v0 on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 

@@ -73,7 +73,7 @@ class Args:
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
     """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
     small: bool = False
-    """a reduced setting for a CPU, by estimate 40 minutes for all stages of RememberColor3-v0"""
+    """a reduced setting for a CPU: by estimate 2 hours for all stages of RememberColor3-v0 on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 
@@ -373,7 +373,7 @@ def main(args: Args) -> None:
     if max(args.gamma, args.gae_lambda) > 1:
         fail(f"--gamma {args.gamma} and --gae-lambda {args.gae_lambda} must be at most 1")
     if args.total_timesteps > 1_000_000 and not CUDA:
-        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes some 40 minutes", flush=True)
+        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
     path = open_run(args)
     checkpoint = load(path / "checkpoint.pt") if (path / "checkpoint.pt").exists() else {}
     if (path / "agent.pt").exists() and not checkpoint:
