@@ -1,15 +1,13 @@
 """AIB stage 2: action-informed belief with a learned prior (paper section 3.2).
 
 A recurrent encoder h of the history, a prior p(z|h), a posterior q(z|u,h) and a decoder p(u|z,h) model what the history
-tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) shapes the posterior; the KL term hands
-that shape to the prior, which is what the robot has when it acts. With --warmup-updates the history encoder first
+tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) shapes the posterior; the KL term
+transfers it to the prior, the only one available at deployment. With --warmup-updates the history encoder first
 learns, on single frames, to find what a memory asks for.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
-Reads:   --repr-dir, by default runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt; where the default has no
-         repr.pt, aib_repr.py runs first
-Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, diagnostics.json, TensorBoard events; args.json and
-         checkpoint.pt to resume
+Reads:   --repr-dir, by default runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt
+Writes:  runs/{env_id}__{exp_name}__{seed}/: belief.pt, TensorBoard events; args.json and checkpoint.pt to resume
 """
 
 import fcntl

@@ -1,7 +1,7 @@
 """AIB stage 1: a random-policy dataset and a compact encoder of the privileged state (paper section 3.1, Algorithm 1).
 
-phi(s) is trained with psi(o) to predict reward and next latents. A KL penalty removes from u = phi(s) what does
-not help to predict, or is seen in o, too. Only phi and the means and standard deviations of images and joints stay.
+phi(s) is trained with psi(o) to predict reward and next latents. The KL penalty keeps in u = phi(s) only what helps
+prediction and o does not show. Saved: phi and the statistics of images and joints.
 
 Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events; args.json and checkpoint.pt to
@@ -69,7 +69,7 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
+    """simulator processes on physx_cpu, each 0.7 GB of memory; results depend on it by float rounding only"""
     small: bool = False
     """a reduced setting for a CPU: by estimate 2 hours for all stages of RememberColor3-v0 on one core"""
     quick: bool = False
@@ -418,8 +418,9 @@ def main(args: Args) -> None:
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
-    """Observation and privileged info of a task that was made with obs_mode state_dict; _view adds the picture.
+    """Pictures and privileged state at once, where MIKASA-Robo gives either; objects that it hid come back.
 
+    The task is made with obs_mode state_dict, and _view adds the picture.
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
     Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all that the task's _get_obs_extra
     returns but the tool's pose; in MIKASA's tasks the cue is in it.

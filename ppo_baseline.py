@@ -44,8 +44,9 @@ CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
     BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
-EVAL_SEED = 2**30 + 2**29  # first seed of evaluations; PPO trains on those below 2**30, stage 1 has those between
-TEST_SEED = EVAL_SEED + 2**20  # first seed of --evaluate, never used for training or tuning
+# seeds: PPO < 2**30 <= stage 1 < EVAL_SEED <= evaluations < TEST_SEED <= --evaluate
+EVAL_SEED = 2**30 + 2**29
+TEST_SEED = EVAL_SEED + 2**20
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -71,7 +72,7 @@ class Args:
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
-    """simulator processes on physx_cpu; with sapien_cuda each takes GPU memory. Changes episodes by rounding only"""
+    """simulator processes on physx_cpu, each 0.7 GB of memory; results depend on it by float rounding only"""
     small: bool = False
     """a reduced setting for a CPU: by estimate 2 hours for all stages of RememberColor3-v0 on one core"""
     quick: bool = False
@@ -80,7 +81,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training; a finished run goes on with a larger number"""
     num_envs: int = 256
-    """episodes per iteration; on physx_cuda all begin with one arm pose, in evaluations too"""
+    """episodes per iteration, not the number of processes; on physx_cuda all begin with one arm pose"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
     cnn_lr_scale: float = 1.0
@@ -124,7 +125,7 @@ class Args:
 
 
 MAY_DIFFER = ("num_workers", "total_timesteps", "checkpoint")  # when a run is resumed
-TASKS = {  # Table 5, where it differs from the defaults above; any other task has InterceptFast-v0's, the defaults
+TASKS = {  # other tasks use the defaults, which are Table 5's for Intercept
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
 }
@@ -198,7 +199,7 @@ class Agent(nn.Module):
         spaces = envs.single_observation_space
         (action_dim,) = envs.single_action_space.shape
         self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
-        # standardises by means and variances averaged over iterations; without --joints-norm (nearly) the identity
+        # running mean and std of the joints; not updated without --joints-norm
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
@@ -385,10 +386,10 @@ def main(args: Args) -> None:
     envs = make_envs(args)
     torch.manual_seed(args.seed)
     agent = Agent(envs, args).to(args.device)
-    others = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]
+    rest_params = [x for name, x in agent.named_parameters() if not name.startswith("cnn.")]
     cnn = {"params": agent.cnn.parameters(), "lr": args.cnn_lr_scale * args.learning_rate}
-    optimizer = torch.optim.Adam([cnn, {"params": others}], lr=args.learning_rate, eps=1e-5, fused=True)
-    completed, evals = checkpoint.get("iteration", 0), checkpoint.get("rows", [])
+    optimizer = torch.optim.Adam([cnn, {"params": rest_params}], lr=args.learning_rate, eps=1e-5, fused=True)
+    completed, evals = checkpoint.get("iteration", 0), checkpoint.get("evals", [])
     reward_var = checkpoint.get("reward_var", 0.0)
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"])
@@ -434,9 +435,9 @@ def main(args: Args) -> None:
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/episodic_return": scalars["train/return"]}
         scalars |= {"charts/updates": len(applied), "charts/SPS": batch_size / (time.time() - start)}
-        if args.joints_norm:  # after the update: within an iteration the policy must not change by itself
+        if args.joints_norm:  # update the statistics last: the ratio needs the rollout's
             agent.joints_norm.train()
-            agent.joints_norm(batch["joints"])  # for its statistics alone
+            agent.joints_norm(batch["joints"])
             agent.joints_norm.eval()
         del buffer, batch, losses, logged  # a gigabyte of images, before the evaluation has its own
 
@@ -457,7 +458,7 @@ def main(args: Args) -> None:
             writer.add_scalar(name, value, global_step)
         writer.flush()
         states = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict(), "reward_var": reward_var}
-        save(path / "checkpoint.pt", {"iteration": iteration, "rows": evals, **states})
+        save(path / "checkpoint.pt", {"iteration": iteration, "evals": evals, **states})
     envs.close()
     for name in ("success_once", "success_at_end", "return"):
         values = [row[name] for row in evals]
@@ -469,8 +470,9 @@ def main(args: Args) -> None:
 
 
 class PrivilegedInfoWrapper(gym.Wrapper):
-    """Observation and privileged info of a task that was made with obs_mode state_dict; _view adds the picture.
+    """Pictures and privileged state at once, where MIKASA-Robo gives either; objects that it hid come back.
 
+    The task is made with obs_mode state_dict, and _view adds the picture.
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
     Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all that the task's _get_obs_extra
     returns but the tool's pose; in MIKASA's tasks the cue is in it.
