@@ -110,6 +110,12 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
     assert json.dumps(metrics, indent=2) in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
+def test_an_agent_plays_in_a_loop_of_ones_own(quick_runs: Path) -> None:
+    agent = quick_runs / f"{TASK}__ppo_aib_quick__1" / "agent.pt"
+    code, out, err = run("docs/examples/play_agent", "--checkpoint", str(agent), cwd=quick_runs.parent)
+    assert code == 0 and f"{TASK}, seed 0: " in out, out + err
+
+
 @pytest.mark.thorough
 def test_an_agent_is_diagnosed_and_nothing_is_written(
     quick_runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture

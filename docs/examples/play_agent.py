@@ -1,0 +1,41 @@
+"""Play an agent of ppo_aib.py in a loop of one's own.
+
+Usage:   python docs/examples/play_agent.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
+Prints:  whether the episode succeeded
+"""
+
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import torch
+import tyro
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+import ppo_aib
+
+
+@torch.no_grad()
+def main(checkpoint: Path, seed: int = 0) -> None:
+    """Play one episode with mean actions."""
+    stored = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    same = {name: stored[name] for name in ("env_id", "image_size", "robot_triangles", "amp", "num_particles")}
+    args = ppo_aib.Args(**same, device="cpu", num_envs=1, num_workers=1)
+    envs = ppo_aib.make_envs(args)
+    agent = ppo_aib.Agent(envs, ppo_aib.AIBBelief(stored["config"]), args)
+    agent.load_state_dict(stored["agent"])
+    obs, _ = envs.reset(seed=[seed])
+    state, succeeded = None, False  # of the belief's memory
+    for _ in range(gym.spec(args.env_id).max_episode_steps):
+        rgb, joints = torch.as_tensor(obs["rgb"]), torch.as_tensor(obs["joints"])
+        h, state = agent.belief.history(rgb, joints, state)
+        p_u = agent.belief.decode(h, torch.randn(1, args.num_particles, agent.belief.config["z_dim"]))
+        dist, _ = agent({"rgb": rgb, "joints": joints, "particles": p_u.sample()})
+        obs, _, _, _, info = envs.step(dist.mean.numpy())
+        succeeded |= bool(info["success"][0])
+    envs.close()
+    print(f"{args.env_id}, seed {seed}: {'a success' if succeeded else 'no success'}")
+
+
+if __name__ == "__main__":  # the simulator's process imports this file, too
+    tyro.cli(main)
