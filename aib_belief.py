@@ -616,12 +616,13 @@ def main(args: Args) -> None:
             save(path / "checkpoint.pt", checkpoint)
 
     # no early stopping: held-out error and likelihood are best before h holds the cue
-    for t in range(len(u)):
-        writer.add_scalar("belief/held_out_u_r2_by_step", r_squared(u[t], estimate[t]), t)
-    writer.close()
     content = {**asdict(args), "config": config}
     content |= {name: stored[name] for name in ("robot_triangles", "image_size")}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
+    u, estimate = validate_belief(model["belief"], episodes, held_out)
+    for t in range(len(u)):
+        writer.add_scalar("belief/held_out_u_r2_by_step", r_squared(u[t], estimate[t]), t)
+    writer.close()
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {r_squared(u[-1], estimate[-1]):.2f}")
 
 

@@ -821,11 +821,12 @@ def train_belief(args: Args, path: Path) -> None:
             save(path / "belief_checkpoint.pt", checkpoint)
 
     # no early stopping: held-out error is best before h holds the cue
+    content = {**asdict(args), "config": config, "belief": model["belief"].state_dict()}
+    save(path / "belief.pt", content)
+    u, estimate = validate_belief(model["belief"], episodes, held_out)
     for t in range(len(u)):
         writer.add_scalar("belief/held_out_u_r2_by_step", r_squared(u[t], estimate[t]), t)
     writer.close()
-    content = {**asdict(args), "config": config, "belief": model["belief"].state_dict()}
-    save(path / "belief.pt", content)
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {r_squared(u[-1], estimate[-1]):.2f}")
 
 

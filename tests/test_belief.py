@@ -76,7 +76,7 @@ def test_the_last_episodes_are_held_out_and_the_last_weights_kept(
     held_out = [16, 17, 18, 19]  # of 20 episodes
     trained = [index for index in read if len(index) == 5]
     assert len(trained) == 6 and max(map(max, trained)) < 16
-    assert [episodes for episodes, _ in looks] == [held_out] * 3
+    assert [episodes for episodes, _ in looks] == [held_out] * 4
     stored = torch.load(path / "belief.pt", weights_only=True)
     phi = torch.load(Path(repr_dir) / "repr.pt", weights_only=True)["phi"]
     state = torch.from_numpy(np.load(Path(repr_dir) / "dataset" / "state.npy")[held_out])
@@ -107,7 +107,7 @@ def test_believers_belief_gets_the_episodes_phi_and_statistics_of_aibs(
     path = train(ppo_believer, repr_dir=str(repr_dir), num_eval_episodes=2, **sizes)
     trained = [index for index in read if len(index) == 4 and 16 not in index]
     assert len(trained) == 3 and max(map(max, trained)) < 16
-    assert [index for index in read if 16 in index] == [[16, 17, 18, 19]]
+    assert [index for index in read if 16 in index] == [[16, 17, 18, 19]] * 2
     belief = torch.load(path / "belief.pt", weights_only=True)["belief"]
     stage_1 = torch.load(repr_dir / "repr.pt", weights_only=True)
     assert all(torch.equal(belief[f"history.{name}"], stage_1["norm"][name]) for name in stage_1["norm"])

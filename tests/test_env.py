@@ -142,7 +142,7 @@ def test_nearest_object_tells_the_right_one(env: gym.Env) -> None:
         assert told.step(np.zeros(8, np.float32))[1] == (key == right)
     buffer = {"rewards": torch.tensor([[1.0, 1.0], [0.0, 1.0]]), "success": torch.tensor([[1.0, 0.0], [0.0, 0.0]])}
     metrics = {"nearest_is_right": 0.5, "success_once": 0.5, "success_at_end": 0.0}
-    assert diagnose_agent.nearest_and_success(buffer) == metrics
+    assert diagnose_agent.diagnose(buffer, None) == metrics
 
 
 def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:

@@ -25,6 +25,6 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_a_killed_run_goes_on_to_the_same_end(reference: Path, tmp_path: Path, script: str, moment: str) -> None:
-    assert len(results(reference / "runs" / f"ToyMemory-v0__{script}__1")) >= 3
+    assert len(results(reference / "runs" / f"ToyMemory-v0__{script}__1")) >= 2
     row = kill_and_go_on(script, moment, reference, tmp_path)
     assert all(row.values()), row

@@ -38,6 +38,7 @@ def play(script: str, arguments: dict, moment: str) -> None:
     """Run a script's main on the toy task; with a moment, up to it."""
     module = importlib.import_module(script)
     toy.take_the_simulators_place(setattr, module)
+    module.VAL_EVERY = 2  # of the scripts that train a belief
     if moment:
         path, count = moment.split(":")
         owner = {"os": os, "torch": torch, "env": toy.ToyMemory}.get(path.split(".")[0], module)
