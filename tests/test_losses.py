@@ -380,6 +380,8 @@ def test_beside_the_elbo_the_prior_and_the_memory_are_trained() -> None:
         wanted = torch.stack([model["teacher"](batch["u"][0], torch.full((B,), t)) for t in range(T + 1)])
         used = wanted if teacher_acts else None
         h, memory = aib_belief.encode_history(model["belief"].history, batch, 0.0, used)
+        own = aib_belief.encode_history(model["belief"].history, batch)[1]
+        assert torch.allclose(memory, own, atol=1e-5), "the GRU goes on with its own memory, whoever answers"
         assert torch.allclose(losses["memory"], 10 * (memory[..., :16] - wanted).square().sum(-1).mean(), atol=1e-4)
         grads = torch.autograd.grad(losses["memory"], list(model["teacher"].parameters()), allow_unused=True)
         assert all(grad is None for grad in grads), "the teacher does not follow"
