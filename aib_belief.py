@@ -77,7 +77,7 @@ class Args:
     image_mask: float = 0.5
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
     occlusion: float = 0.5
-    """share of the episodes in which the object is hidden from a random step on while the belief is trained"""
+    """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
     warmup_updates: int = 0
     """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
     prior_nll: float = 0.0
@@ -595,8 +595,9 @@ def main(args: Args) -> None:
             losses = warmup_losses(model, frames, args)
         else:
             batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
-            hide_objects(model, batch, args.occlusion, rng)
-            losses = belief_losses(model, batch, args, teacher_acts=progress < 0.5)
+            if args.warmup_updates:  # else the teacher knows nothing
+                hide_objects(model, batch, args.occlusion, rng)
+            losses = belief_losses(model, batch, args, teacher_acts=args.warmup_updates > 0 and progress < 0.5)
         optimizer.zero_grad()
         losses["total"].backward()
         # one bad batch can erase what h remembers

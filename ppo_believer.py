@@ -101,7 +101,7 @@ class Args:
     image_mask: float = 0.5
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
     occlusion: float = 0.5
-    """share of the episodes in which the object is hidden from a random step on while the belief is trained"""
+    """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
     warmup_updates: int = 0
     """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
     prior_nll: float = 0.0
@@ -800,8 +800,9 @@ def train_belief(args: Args, path: Path) -> None:
             losses = warmup_losses(model, frames, args)
         else:
             batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
-            hide_objects(model, batch, args.occlusion, rng)
-            losses = believer_losses(model, batch, args, teacher_acts=progress < 0.5)
+            if args.warmup_updates:  # else the teacher knows nothing
+                hide_objects(model, batch, args.occlusion, rng)
+            losses = believer_losses(model, batch, args, teacher_acts=args.warmup_updates > 0 and progress < 0.5)
         optimizer.zero_grad()
         losses["total"].backward()
         # one bad batch can erase what h remembers
