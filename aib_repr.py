@@ -101,7 +101,7 @@ class Args:
     """image network in bfloat16"""
 
 
-MAY_DIFFER = "num_workers"  # when a run is resumed
+MAY_DIFFER = ("num_workers",)  # when a run is resumed
 TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(
     exp_name="aib_repr_small",
