@@ -74,7 +74,7 @@ class Args:
     """weight of the action head's loss"""
     fm_latent: Literal["mean", "sample"] = "mean"
     """z that the action head gets: means of q; or samples of q (the paper's choice), mostly noise at first"""
-    image_mask: float = 0.5
+    image_mask: float = 0.25
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
     occlusion: float = 0.5
     """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
@@ -172,58 +172,62 @@ class HistoryEncoder(nn.Module):
 
     The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
     it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
-    A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are attention
-    with questions that are always the same ones, as the moving ball's place.
+    A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are where
+    attention with constant queries looks among 32 x 32 blocks of pixels, as at a moving ball, which must be located
+    within a pixel (a spatial softmax, Levine et al., 2016).
     The paper's history (E.2) has past actions, too: left out, as joints show them (a_t from joints at t and t + 1).
     """
 
     def __init__(self, config: dict):
         super().__init__()
         height, width, _ = config["image_shape"]
-        self.patch = min(height, width) // 16  # pixels
+        self.patch, self.block = min(height, width) // 16, min(height, width) // 32  # pixels
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
         self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
-        lines = [torch.linspace(-1, 1, length // self.patch) for length in (height, width)]
-        self.register_buffer("coordinates", torch.cartesian_prod(*lines))
+        for name, size in ("patch_coordinates", self.patch), ("block_coordinates", self.block):
+            lines = [torch.linspace(-1, 1, length // size) for length in (height, width)]
+            self.register_buffer(name, torch.cartesian_prod(*lines))
         self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
         self.token_heads = nn.Linear(64, 16 + 8 + 32)
-        self.point = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 32, 32]), nn.ReLU()))
-        self.point_heads = nn.Linear(32, 16 + 8)
+        self.point = orthogonal_init(mlp([3 * self.block**2, 32, 16]))
         self.point_queries = nn.Parameter(torch.randn(8, 16))
         self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
         self.sure = nn.Linear(1, 1)  # starts as sigmoid(10 (largest weight - 0.4))
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
-        self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
+        self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
         self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
         self.gru = nn.GRUCell(64 + 32, 256)
 
     def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
-        """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 80), summary.
+        """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
 
         Contents are coordinates and values; the summary is (B, 32). mask: share of the blocks of 2 x 2 pixels that are
-        replaced by the mean.
+        replaced by the mean for all but the keypoints.
         """
         images = rgb.float().sub_(self.image_mean).div_(self.image_std)
+        point_keys = self.point(self.cut(images, self.block))
+        keypoints, _ = self.attend(self.point_queries, point_keys, self.block_coordinates)
         if mask:
             batch, height, width = rgb.shape[0], rgb.shape[1] // 2, rgb.shape[2] // 2  # in blocks
             kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
+            images = images.clone()  # the keypoints' stay as they are
             images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
-        # a convolution whose kernel and stride are a patch, as a linear layer
-        patches = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch).flatten(1, 2).flatten(2)
-        coordinates = self.coordinates.expand(len(rgb), -1, -1)
-        keys, values, features = self.token_heads(self.token(patches)).split([16, 8, 32], -1)
-        contents = torch.cat([coordinates, values], -1)
-        point_keys, values = self.point_heads(self.point(patches)).split([16, 8], -1)
-        keypoints, _ = self.attend(self.point_queries, point_keys, torch.cat([coordinates, values], -1))
+        tokens = self.token(self.cut(images, self.patch))
+        keys, values, features = self.token_heads(tokens).split([16, 8, 32], -1)
+        contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
         return keys, contents, keypoints.flatten(1), features.relu().amax(1)
 
+    def cut(self, images: Tensor, size: int) -> Tensor:
+        """Images (B, H, W, 3) -> N patches (B, N, 3 size^2); a linear layer on them is a convolution of that stride."""
+        return images.unfold(1, size, size).unfold(2, size, size).flatten(1, 2).flatten(2)
+
     def attend(self, queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, 10), log weights (..., Q, N)."""
+        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N)."""
         queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
         log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
         return log_weights.exp() @ contents, log_weights
@@ -348,8 +352,9 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
 
     The teacher's memory, of the privileged state at the episode's start, asks in place of the GRU's (as the first
-    phase of Kumar et al., 2021). error: of u from z ~ p(z), mean of three. place: -log sum_i w_i N(u; locator(patch i))
+    phase of Kumar et al., 2021). error: of u from z ~ p(z), mean of two. place: -log sum_i w_i N(u; locator(patch i))
     over the attention's weights w_i, which tells it where u says that the object is; locator: its error of u.
+    keypoints: error of the state decoded from them, in units of its spread among episodes at that step.
     """
     belief, history, u = model["belief"], model["belief"].history, batch["u"]
     keys, contents, keypoints, _ = history.look(batch["rgb"], args.image_mask)
@@ -357,12 +362,13 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     memory = torch.cat([memory, torch.zeros_like(memory)], -1)
     place, log_weights = history.ask(memory, keys, contents)
     losses = {"error": 0.0}
-    # all that is known, then the place alone and keypoints alone: else nobody looks for what the memory knows
-    for knows_memory, knows_place, knows_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
-        places = history.place(torch.cat([knows_place * place, knows_keypoints * keypoints], -1))
-        h = history.combine(knows_memory * memory, places, history.joints_mean)  # joints would identify an episode
+    for all_known in (1, 0):  # then the place alone: else nobody looks for what the memory knows
+        places = history.place(torch.cat([place, all_known * keypoints], -1))
+        h = history.combine(all_known * memory, places, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
-        losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
+        losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 2
+    state_error = (model["state_decoder"](keypoints) - batch["state"]) * batch["state_weight"]
+    losses["keypoints"] = 4 * state_error.square().mean()
     located = model["locator"](contents)
     # the locator's mean is fitted at the attended place alone: fitted here, it could place objects anywhere
     log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
@@ -470,10 +476,16 @@ def belief_losses(
 
 
 class EpisodeDataset:
-    """Whole episodes of dataset/ and their u (N, T+1, u_dim), on the disk, or on the GPU where they fit there."""
+    """Whole episodes of dataset/, on the disk, or on the GPU where they fit there.
 
-    def __init__(self, dataset: Path, u: Tensor, device: str):
-        self.device, self.arrays = device, {"u": u.to(device)}
+    With their u (N, T+1, u_dim) and standardised state (N, T+1, D).
+    """
+
+    def __init__(self, dataset: Path, u: Tensor, state: Tensor, device: str):
+        self.device, self.arrays, self.state = device, {"u": u.to(device)}, state.to(device)
+        spread = self.state.std(0)  # among episodes, at each step
+        # a part that tells episodes apart counts equally at each step, any other nothing
+        self.state_weight = (spread > 0.05) / (spread + 0.01)
         for name in ("rgb", "joints", "actions"):
             x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of read-only arrays
             fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
@@ -487,13 +499,17 @@ class EpisodeDataset:
         return {name: x[index].to(self.device).transpose(0, 1) for name, x in self.arrays.items()}
 
     def frames(self, episode: np.ndarray, t: np.ndarray) -> dict[str, Tensor]:
-        """Single frames of episodes (B,) at steps t (B,): rgb (B, H, W, 3), u, t, and the episode's first u, u_0."""
+        """Single frames of episodes (B,) at steps t (B,): rgb (B, H, W, 3), u, t, and the episode's first u, u_0.
+
+        And the state with the weights of its parts at t, both (B, D).
+        """
         batch = {name: self.arrays[name][episode, t].to(self.device) for name in ("rgb", "u")}
-        return batch | {"u_0": self.arrays["u"][episode, 0].to(self.device), "t": torch.from_numpy(t).to(self.device)}
+        batch |= {"u_0": self.arrays["u"][episode, 0].to(self.device), "t": torch.from_numpy(t).to(self.device)}
+        return batch | {"state": self.state[episode, t], "state_weight": self.state_weight[t]}
 
 
 def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]:
-    """Open stage 1's output: episodes with u = mean of phi(s), and repr.pt, checked by load."""
+    """Open stage 1's output: episodes with state and u = mean of phi(s), and repr.pt, checked by load."""
     preset = "small" if args.small else "quick" if args.quick else ""
     path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{preset and '_' + preset}__{args.seed}")
     if not (path / "repr.pt").exists():
@@ -503,8 +519,10 @@ def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
     with torch.no_grad():
-        u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
-    return EpisodeDataset(path / "dataset", u, args.device), stored
+        state = torch.from_numpy(np.load(path / "dataset" / "state.npy"))
+        u = phi(state).mean
+        state = ((state - phi.mean) / phi.std).clamp(-3, 3)  # a hit ball spins at hundreds
+    return EpisodeDataset(path / "dataset", u, state, args.device), stored
 
 
 # ---------------------------------------------------------------- evaluation
@@ -560,6 +578,7 @@ def main(args: Args) -> None:
     # PPO needs neither posterior nor head: belief.pt goes without them
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     model["teacher"], model["locator"] = Teacher(config["u_dim"]), Locator(config["u_dim"])
+    model["state_decoder"] = mlp([8 * 2, 64, episodes.state.shape[-1]])
     if args.action_head != "none":
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
         model["head"] = mlp([inputs, 256, action_dim])
@@ -590,7 +609,7 @@ def main(args: Args) -> None:
         if progress < 0:
             episode = rng.choice(train, 8 * args.batch_episodes)
             # early steps more often, as they show what is to be remembered
-            t = (len(sample["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
+            t = (len(sample["rgb"]) * rng.random(len(episode)) ** 2).astype(int)
             frames = episodes.frames(episode, t)
             losses = warmup_losses(model, frames, args)
         else:

@@ -231,58 +231,62 @@ class HistoryEncoder(nn.Module):
 
     The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
     it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
-    A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are attention
-    with questions that are always the same ones, as the moving ball's place.
+    A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are where
+    attention with constant queries looks among 32 x 32 blocks of pixels, as at a moving ball, which must be located
+    within a pixel (a spatial softmax, Levine et al., 2016).
     The paper's history (E.2) has past actions, too: left out, as joints show them (a_t from joints at t and t + 1).
     """
 
     def __init__(self, config: dict):
         super().__init__()
         height, width, _ = config["image_shape"]
-        self.patch = min(height, width) // 16  # pixels
+        self.patch, self.block = min(height, width) // 16, min(height, width) // 32  # pixels
         self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
         self.register_buffer("image_std", torch.tensor(255.0))
         self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
-        lines = [torch.linspace(-1, 1, length // self.patch) for length in (height, width)]
-        self.register_buffer("coordinates", torch.cartesian_prod(*lines))
+        for name, size in ("patch_coordinates", self.patch), ("block_coordinates", self.block):
+            lines = [torch.linspace(-1, 1, length // size) for length in (height, width)]
+            self.register_buffer(name, torch.cartesian_prod(*lines))
         self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
         self.token_heads = nn.Linear(64, 16 + 8 + 32)
-        self.point = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 32, 32]), nn.ReLU()))
-        self.point_heads = nn.Linear(32, 16 + 8)
+        self.point = orthogonal_init(mlp([3 * self.block**2, 32, 16]))
         self.point_queries = nn.Parameter(torch.randn(8, 16))
         self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
         self.sure = nn.Linear(1, 1)  # starts as sigmoid(10 (largest weight - 0.4))
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
-        self.place = orthogonal_init(mlp([9 * (2 + 8), 64, 64]))
+        self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
         self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
         self.gru = nn.GRUCell(64 + 32, 256)
 
     def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
-        """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 80), summary.
+        """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
 
         Contents are coordinates and values; the summary is (B, 32). mask: share of the blocks of 2 x 2 pixels that are
-        replaced by the mean.
+        replaced by the mean for all but the keypoints.
         """
         images = rgb.float().sub_(self.image_mean).div_(self.image_std)
+        point_keys = self.point(self.cut(images, self.block))
+        keypoints, _ = self.attend(self.point_queries, point_keys, self.block_coordinates)
         if mask:
             batch, height, width = rgb.shape[0], rgb.shape[1] // 2, rgb.shape[2] // 2  # in blocks
             kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
+            images = images.clone()  # the keypoints' stay as they are
             images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
-        # a convolution whose kernel and stride are a patch, as a linear layer
-        patches = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch).flatten(1, 2).flatten(2)
-        coordinates = self.coordinates.expand(len(rgb), -1, -1)
-        keys, values, features = self.token_heads(self.token(patches)).split([16, 8, 32], -1)
-        contents = torch.cat([coordinates, values], -1)
-        point_keys, values = self.point_heads(self.point(patches)).split([16, 8], -1)
-        keypoints, _ = self.attend(self.point_queries, point_keys, torch.cat([coordinates, values], -1))
+        tokens = self.token(self.cut(images, self.patch))
+        keys, values, features = self.token_heads(tokens).split([16, 8, 32], -1)
+        contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
         return keys, contents, keypoints.flatten(1), features.relu().amax(1)
 
+    def cut(self, images: Tensor, size: int) -> Tensor:
+        """Images (B, H, W, 3) -> N patches (B, N, 3 size^2); a linear layer on them is a convolution of that stride."""
+        return images.unfold(1, size, size).unfold(2, size, size).flatten(1, 2).flatten(2)
+
     def attend(self, queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, 10), log weights (..., Q, N)."""
+        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N)."""
         queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
         log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
         return log_weights.exp() @ contents, log_weights

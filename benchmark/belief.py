@@ -145,15 +145,15 @@ def load_run(run: Path) -> tuple[nn.ModuleDict, object, aib_belief.EpisodeDatase
     belief = ppo_believer.BelieverBelief(config) if believer else aib_belief.AIBBelief(config)
     if believer:
         belief.prior = lambda h: Normal(h.new_zeros(*h.shape[:-1], args.z_dim), 1.0)
-    model = nn.ModuleDict({"belief": belief, "teacher": script.Teacher(config["u_dim"])})
-    model["locator"] = script.Locator(config["u_dim"])
+    model = nn.ModuleDict({"belief": belief})
     model["posterior"] = script.GaussianMLP(config["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     if not believer and args.action_head != "none":
         action_dim = episodes.arrays["actions"].shape[-1]
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
         model["head"] = aib_belief.mlp([inputs, 256, action_dim])
     checkpoint = aib_belief.load(run / ("belief_checkpoint.pt" if believer else "checkpoint.pt"))
-    model.load_state_dict(checkpoint["model"])
+    trained = checkpoint["model"]  # also what helped to train the belief
+    model.load_state_dict({name: x for name, x in trained.items() if name.partition(".")[0] in model})
     return model.to(args.device), args, episodes, cue, stored["num_val"]
 
 

@@ -33,6 +33,7 @@ def belief_model(head: str = "flow", config: dict = CONFIG) -> nn.ModuleDict:
     model["posterior"] = aib_belief.GaussianMLP(config["u_dim"] + 256, [32], config["z_dim"], min_std=0.1)
     model["head"] = aib_belief.mlp([2 * config["z_dim"] + (A + 1) * (head == "flow"), 32, A])
     model["teacher"], model["locator"] = aib_belief.Teacher(config["u_dim"]), aib_belief.Locator(config["u_dim"])
+    model["state_decoder"] = aib_belief.mlp([16, 8, 3])
     model["teacher"].eval()
     nn.init.orthogonal_(model["belief"].history.arm.weight)  # starts at 0
     return model
@@ -277,7 +278,7 @@ def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
     rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255  # a patch is 2 x 2 pixels here
     keys, contents, keypoints, summary = history.look(rgb)
     assert keys.shape == (2, 18**2, 16) and contents.shape == (2, 18**2, 10)
-    assert keypoints.shape == (2, 8 * 10) and summary.shape == (2, 32)
+    assert keypoints.shape == (2, 8 * 2) and summary.shape == (2, 32)
     patches = [2 * 18 + 5, 15 * 18 + 10]
     assert torch.allclose(keys[0, patches[0]], keys[1, patches[1]]), "a key holds no coordinates"
     assert torch.allclose(keys[0, 0], keys[1, 99]) and not torch.allclose(keys[0, 0], keys[0, patches[0]])
@@ -296,18 +297,17 @@ def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
 def test_keypoints_move_with_what_they_show() -> None:
     history, rgb = belief_model()["belief"].history, torch.zeros(2, *IMAGE, dtype=torch.uint8)
     rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255
-    patches = torch.tensor([2 * 18 + 5, 15 * 18 + 10])
-    with torch.no_grad():  # one that shows red alone
-        history.point_heads.weight[:16], history.point_heads.bias[:16] = torch.randn(16, 32), 0
+    with torch.no_grad():
         images = (rgb.float() - history.image_mean) / history.image_std
-        red = images[0, 4:6, 10:12].flatten()
-        history.point_queries[0] = 30 * history.point_heads(history.point(red))[:16]
+        red = history.point(images[0, 4, 10])
+        history.point_queries[0] = red - history.point(images[0, 0, 0])  # asks for red and not for black
     history.attend = lambda queries, keys, contents: (
         (50 * nn.functional.layer_norm(queries, [16]) @ nn.functional.layer_norm(keys, [16]).mT).softmax(-1) @ contents,
         None,
     )
-    places = history.look(rgb)[2].unflatten(1, (8, 10))[:, 0, :2]
-    assert torch.allclose(places, history.coordinates[patches], atol=0.05)
+    places = history.look(rgb, mask=0.9)[2].unflatten(1, (8, 2))[:, 0]  # keypoints see what is masked, too
+    middle = torch.tensor([[4.5, 10.5], [30.5, 20.5]]) / 35 * 2 - 1
+    assert torch.allclose(places, middle, atol=0.02)
 
 
 def test_a_place_is_kept_while_the_attention_is_not_sure() -> None:
@@ -334,7 +334,7 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     model = belief_model()
     model["teacher"].train()
     batch = {"rgb": belief_batch()["rgb"][0], "u": torch.randn(B, 4), "u_0": torch.randn(B, 4)}
-    batch["t"] = torch.arange(B) + 1
+    batch |= {"t": torch.arange(B) + 1, "state": torch.randn(B, 3), "state_weight": torch.rand(B, 3)}
     torch.manual_seed(3)
     losses = aib_belief.warmup_losses(model, batch, losses_args())
     history, belief = model["belief"].history, model["belief"]
@@ -346,18 +346,20 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     weights, errors = log_weights.exp(), []
     memory = torch.cat([memory, torch.zeros(B, 16)], -1)
     torch.manual_seed(3)
-    for parts in ((memory, place, keypoints), (0 * memory, place, 0 * keypoints), (0 * memory, 0 * place, keypoints)):
+    for parts in ((memory, place, keypoints), (0 * memory, place, 0 * keypoints)):
         h = history.out(torch.cat([parts[0], history.place(torch.cat(parts[1:], -1))], -1)) + history.arm.bias
         p = belief.prior(h)
         decoded = belief.decoder(torch.cat([p.mean + p.stddev * torch.randn(B, 1, 5)[:, 0], h], -1))
         errors.append((decoded.mean - batch["u"]).square().sum(-1).mean())
-    assert torch.allclose(losses["error"], sum(errors) / 3, atol=1e-4)
+    assert torch.allclose(losses["error"], sum(errors) / 2, atol=1e-4)
     located = model["locator"](contents)
     density = Normal(located.mean, located.stddev).log_prob(batch["u"][:, None]).sum(-1).exp()
     assert torch.allclose(losses["place"], -(weights * density).sum(-1).log().mean(), atol=1e-4)
     at_place = model["locator"](place).mean
     assert torch.allclose(losses["locator"], (at_place - batch["u"]).square().sum(-1).mean(), atol=1e-4)
-    assert torch.allclose(losses["total"], losses["error"] + losses["place"] + losses["locator"])
+    state_error = (model["state_decoder"](keypoints) - batch["state"]) * batch["state_weight"]
+    assert torch.allclose(losses["keypoints"], 4 * state_error.square().sum() / (B * 3), atol=1e-4)
+    assert torch.allclose(losses["total"], sum(losses[name] for name in ("error", "place", "locator", "keypoints")))
 
     def gradient(loss: str, parameter: torch.Tensor) -> float:
         grad = torch.autograd.grad(losses[loss], parameter, retain_graph=True, allow_unused=True)[0]
@@ -367,6 +369,7 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     assert gradient("locator", locator) > 0 and gradient("place", locator) == 0, "fitted at the attended place alone"
     assert gradient("locator", history.query[0].weight) == 0 and gradient("place", history.query[0].weight) > 0
     assert gradient("place", model["locator"].raw_std) > 0
+    assert gradient("keypoints", history.point_queries) > 0
 
 
 def test_beside_the_elbo_the_prior_and_the_memory_are_trained() -> None:
