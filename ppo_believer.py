@@ -79,7 +79,7 @@ class Args:
     """triangles of each robot mesh, about; with 500 a CPU steps 5 to 10 times as fast; 0: meshes as they are"""
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
-    num_workers: int = 16 if CUDA else 2 * len(os.sched_getaffinity(0))
+    num_workers: int = 16 if CUDA else min(16, 2 * len(os.sched_getaffinity(0)))
     """simulator processes on physx_cpu, each 0.7 GB of memory; results depend on it by float rounding only"""
     small: bool = False
     """a reduced setting for a CPU: by estimate 2 hours for all stages of RememberColor3-v0 on one core"""

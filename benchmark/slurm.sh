@@ -15,6 +15,7 @@
 # is queued again and goes on from its last checkpoint. Where a job fails the later arrays are cancelled: submit again,
 # finished commands do nothing. Change the lines above to what your cluster wants.
 set -euo pipefail
+export TQDM_MININTERVAL=30  # seconds between two states of a progress bar: each is a line of the log
 
 if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
     mkdir -p runs

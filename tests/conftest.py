@@ -32,7 +32,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each process
 
 def run(script: str, *arguments: str, cwd: Path, env: dict | None = None, timeout: float = 600) -> tuple[int, str, str]:
     """Run a script as a user would; exit code, stdout, stderr."""
-    command = [sys.executable, str(ROOT / f"{script}.py"), *arguments]
+    # a warning on account of a script's own line is an error
+    command = [sys.executable, "-W", "error:::__main__", str(ROOT / f"{script}.py"), *arguments]
     done = subprocess.run(
         command, cwd=cwd, env={**os.environ, **(env or {})}, capture_output=True, text=True, timeout=timeout
     )
