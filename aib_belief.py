@@ -91,7 +91,7 @@ SMALL = dict(
     num_updates=1500,
     batch_episodes=16,
     belief_lr=2e-3,
-    warmup_updates=4000,
+    warmup_updates=2500,
     prior_nll=1.0,
 )
 QUICK = dict(exp_name="aib_belief_quick", warmup_updates=2, num_updates=4, batch_episodes=4)
@@ -352,9 +352,8 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
 
     The teacher's memory, of the privileged state at the episode's start, asks in place of the GRU's (as the first
-    phase of Kumar et al., 2021). error: of u from z ~ p(z), mean of two. place: -log sum_i w_i N(u; locator(patch i))
+    phase of Kumar et al., 2021). error: of u from z ~ p(z), mean of three. place: -log sum_i w_i N(u; locator(patch i))
     over the attention's weights w_i, which tells it where u says that the object is; locator: its error of u.
-    keypoints: error of the state decoded from them, in units of its spread among episodes at that step.
     """
     belief, history, u = model["belief"], model["belief"].history, batch["u"]
     keys, contents, keypoints, _ = history.look(batch["rgb"], args.image_mask)
@@ -362,13 +361,12 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     memory = torch.cat([memory, torch.zeros_like(memory)], -1)
     place, log_weights = history.ask(memory, keys, contents)
     losses = {"error": 0.0}
-    for all_known in (1, 0):  # then the place alone: else nobody looks for what the memory knows
-        places = history.place(torch.cat([place, all_known * keypoints], -1))
-        h = history.combine(all_known * memory, places, history.joints_mean)  # joints would identify an episode
+    # all that is known, then the place alone and keypoints alone: else nobody looks for what the memory knows
+    for knows_memory, knows_place, knows_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
+        places = history.place(torch.cat([knows_place * place, knows_keypoints * keypoints], -1))
+        h = history.combine(knows_memory * memory, places, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
-        losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 2
-    state_error = (model["state_decoder"](keypoints) - batch["state"]) * batch["state_weight"]
-    losses["keypoints"] = 4 * state_error.square().mean()
+        losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
     located = model["locator"](contents)
     # the locator's mean is fitted at the attended place alone: fitted here, it could place objects anywhere
     log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
@@ -476,16 +474,10 @@ def belief_losses(
 
 
 class EpisodeDataset:
-    """Whole episodes of dataset/, on the disk, or on the GPU where they fit there.
+    """Whole episodes of dataset/ and their u (N, T+1, u_dim), on the disk, or on the GPU where they fit there."""
 
-    With their u (N, T+1, u_dim) and standardised state (N, T+1, D).
-    """
-
-    def __init__(self, dataset: Path, u: Tensor, state: Tensor, device: str):
-        self.device, self.arrays, self.state = device, {"u": u.to(device)}, state.to(device)
-        spread = self.state.std(0)  # among episodes, at each step
-        # a part that tells episodes apart counts equally at each step, any other nothing
-        self.state_weight = (spread > 0.05) / (spread + 0.01)
+    def __init__(self, dataset: Path, u: Tensor, device: str):
+        self.device, self.arrays = device, {"u": u.to(device)}
         for name in ("rgb", "joints", "actions"):
             x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of read-only arrays
             fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
@@ -499,17 +491,13 @@ class EpisodeDataset:
         return {name: x[index].to(self.device).transpose(0, 1) for name, x in self.arrays.items()}
 
     def frames(self, episode: np.ndarray, t: np.ndarray) -> dict[str, Tensor]:
-        """Single frames of episodes (B,) at steps t (B,): rgb (B, H, W, 3), u, t, and the episode's first u, u_0.
-
-        And the state with the weights of its parts at t, both (B, D).
-        """
+        """Single frames of episodes (B,) at steps t (B,): rgb (B, H, W, 3), u, t, and the episode's first u, u_0."""
         batch = {name: self.arrays[name][episode, t].to(self.device) for name in ("rgb", "u")}
-        batch |= {"u_0": self.arrays["u"][episode, 0].to(self.device), "t": torch.from_numpy(t).to(self.device)}
-        return batch | {"state": self.state[episode, t], "state_weight": self.state_weight[t]}
+        return batch | {"u_0": self.arrays["u"][episode, 0].to(self.device), "t": torch.from_numpy(t).to(self.device)}
 
 
 def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]:
-    """Open stage 1's output: episodes with state and u = mean of phi(s), and repr.pt, checked by load."""
+    """Open stage 1's output: episodes with u = mean of phi(s), and repr.pt, checked by load."""
     preset = "small" if args.small else "quick" if args.quick else ""
     path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{preset and '_' + preset}__{args.seed}")
     if not (path / "repr.pt").exists():
@@ -519,10 +507,8 @@ def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
     phi.load_state_dict(stored["phi"])
     with torch.no_grad():
-        state = torch.from_numpy(np.load(path / "dataset" / "state.npy"))
-        u = phi(state).mean
-        state = ((state - phi.mean) / phi.std).clamp(-3, 3)  # a hit ball spins at hundreds
-    return EpisodeDataset(path / "dataset", u, state, args.device), stored
+        u = phi(torch.from_numpy(np.load(path / "dataset" / "state.npy"))).mean
+    return EpisodeDataset(path / "dataset", u, args.device), stored
 
 
 # ---------------------------------------------------------------- evaluation
@@ -578,7 +564,6 @@ def main(args: Args) -> None:
     # PPO needs neither posterior nor head: belief.pt goes without them
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     model["teacher"], model["locator"] = Teacher(config["u_dim"]), Locator(config["u_dim"])
-    model["state_decoder"] = mlp([8 * 2, 64, episodes.state.shape[-1]])
     if args.action_head != "none":
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
         model["head"] = mlp([inputs, 256, action_dim])
@@ -609,7 +594,7 @@ def main(args: Args) -> None:
         if progress < 0:
             episode = rng.choice(train, 8 * args.batch_episodes)
             # early steps more often, as they show what is to be remembered
-            t = (len(sample["rgb"]) * rng.random(len(episode)) ** 2).astype(int)
+            t = (len(sample["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
             frames = episodes.frames(episode, t)
             losses = warmup_losses(model, frames, args)
         else:

@@ -113,21 +113,6 @@ def test_believers_belief_gets_the_episodes_phi_and_statistics_of_aibs(
     assert all(torch.equal(belief[f"history.{name}"], stage_1["norm"][name]) for name in stage_1["norm"])
 
 
-def test_frames_show_the_state_and_what_tells_episodes_apart(toy_stages: Path) -> None:
-    path = toy_stages / f"{TOY}__aib_repr__1"
-    episodes, _ = aib_belief.load_episodes(aib_belief.Args(env_id=TOY, repr_dir=str(path), device="cpu"))
-    frames = episodes.frames(np.array([3, 5]), np.array([0, 4]))
-    state = np.load(path / "dataset" / "state.npy")
-    phi = torch.load(path / "repr.pt", weights_only=True)["phi"]
-    state = ((state - phi["mean"].numpy()) / phi["std"].numpy()).clip(-3, 3)
-    spread = state.std(0, ddof=1)
-    weight = np.where(spread > 0.05, 1 / (spread + 0.01), 0)
-    assert 0 in weight and weight.max() > 0
-    assert np.allclose(frames["state"], state[[3, 5], [0, 4]], atol=1e-5)
-    assert np.allclose(frames["state_weight"], weight[[0, 4]], rtol=1e-4)
-    assert torch.equal(frames["u_0"], episodes.arrays["u"][[3, 5], 0]) and frames["t"].tolist() == [0, 4]
-
-
 @pytest.mark.parametrize("warmup_updates", [2, 0])
 @pytest.mark.parametrize("script", ["aib_belief", "ppo_believer"])
 def test_warm_up_then_the_teacher_acts_then_the_memory(

@@ -33,7 +33,6 @@ def belief_model(head: str = "flow", config: dict = CONFIG) -> nn.ModuleDict:
     model["posterior"] = aib_belief.GaussianMLP(config["u_dim"] + 256, [32], config["z_dim"], min_std=0.1)
     model["head"] = aib_belief.mlp([2 * config["z_dim"] + (A + 1) * (head == "flow"), 32, A])
     model["teacher"], model["locator"] = aib_belief.Teacher(config["u_dim"]), aib_belief.Locator(config["u_dim"])
-    model["state_decoder"] = aib_belief.mlp([16, 8, 3])
     model["teacher"].eval()
     nn.init.orthogonal_(model["belief"].history.arm.weight)  # starts at 0
     return model
@@ -334,7 +333,7 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     model = belief_model()
     model["teacher"].train()
     batch = {"rgb": belief_batch()["rgb"][0], "u": torch.randn(B, 4), "u_0": torch.randn(B, 4)}
-    batch |= {"t": torch.arange(B) + 1, "state": torch.randn(B, 3), "state_weight": torch.rand(B, 3)}
+    batch["t"] = torch.arange(B) + 1
     torch.manual_seed(3)
     losses = aib_belief.warmup_losses(model, batch, losses_args())
     history, belief = model["belief"].history, model["belief"]
@@ -346,20 +345,18 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     weights, errors = log_weights.exp(), []
     memory = torch.cat([memory, torch.zeros(B, 16)], -1)
     torch.manual_seed(3)
-    for parts in ((memory, place, keypoints), (0 * memory, place, 0 * keypoints)):
+    for parts in ((memory, place, keypoints), (0 * memory, place, 0 * keypoints), (0 * memory, 0 * place, keypoints)):
         h = history.out(torch.cat([parts[0], history.place(torch.cat(parts[1:], -1))], -1)) + history.arm.bias
         p = belief.prior(h)
         decoded = belief.decoder(torch.cat([p.mean + p.stddev * torch.randn(B, 1, 5)[:, 0], h], -1))
         errors.append((decoded.mean - batch["u"]).square().sum(-1).mean())
-    assert torch.allclose(losses["error"], sum(errors) / 2, atol=1e-4)
+    assert torch.allclose(losses["error"], sum(errors) / 3, atol=1e-4)
     located = model["locator"](contents)
     density = Normal(located.mean, located.stddev).log_prob(batch["u"][:, None]).sum(-1).exp()
     assert torch.allclose(losses["place"], -(weights * density).sum(-1).log().mean(), atol=1e-4)
     at_place = model["locator"](place).mean
     assert torch.allclose(losses["locator"], (at_place - batch["u"]).square().sum(-1).mean(), atol=1e-4)
-    state_error = (model["state_decoder"](keypoints) - batch["state"]) * batch["state_weight"]
-    assert torch.allclose(losses["keypoints"], 4 * state_error.square().sum() / (B * 3), atol=1e-4)
-    assert torch.allclose(losses["total"], sum(losses[name] for name in ("error", "place", "locator", "keypoints")))
+    assert torch.allclose(losses["total"], losses["error"] + losses["place"] + losses["locator"])
 
     def gradient(loss: str, parameter: torch.Tensor) -> float:
         grad = torch.autograd.grad(losses[loss], parameter, retain_graph=True, allow_unused=True)[0]
@@ -369,7 +366,6 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     assert gradient("locator", locator) > 0 and gradient("place", locator) == 0, "fitted at the attended place alone"
     assert gradient("locator", history.query[0].weight) == 0 and gradient("place", history.query[0].weight) > 0
     assert gradient("place", model["locator"].raw_std) > 0
-    assert gradient("keypoints", history.point_queries) > 0
 
 
 def test_beside_the_elbo_the_prior_and_the_memory_are_trained() -> None:
