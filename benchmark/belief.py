@@ -39,18 +39,22 @@ def are_classes(y: Tensor) -> bool:
 
 
 def probe_score(x: Tensor, y: Tensor, x_test: Tensor, y_test: Tensor) -> float:
-    """Linear probe of y (N, K) from x (N, F): R2, or accuracy of classes, on x_test and y_test, mean over y's columns.
+    """Linear probe of y (N, K) from x (N, F): R2, or accuracy of classes, on x_test and y_test.
 
-    The ridge of R2 is chosen by cross-validation. Columns that do not vary are left out; nan when none does.
+    Accuracy is the mean over y's columns, R2 that of y as a vector, with a ridge chosen by cross-validation. Columns
+    that do not vary are left out; nan when none does.
     """
+    classes = are_classes(y)
     model = linear_model.RidgeCV(np.logspace(-3, 4, 8))
-    if are_classes(y):
+    if classes:
         model = linear_model.LogisticRegression(max_iter=1000)
     model = pipeline.make_pipeline(preprocessing.StandardScaler(), model)
     x, y, x_test, y_test = (array.cpu().numpy() for array in (x, y, x_test, y_test))
     varying = np.flatnonzero(np.ptp(y, axis=0))
     scores = [model.fit(x, y[:, k]).score(x_test, y_test[:, k]) for k in varying]
-    return float(np.mean(scores)) if scores else math.nan
+    if not scores:
+        return math.nan
+    return float(np.average(scores, weights=None if classes else y_test.var(0)[varying]))
 
 
 @torch.no_grad()

@@ -489,6 +489,8 @@ def test_readout_score_on_features_of_known_content() -> None:
     assert -0.1 < score(noise, count=210) < 0.1, "as many episodes as features: without a good ridge far below 0"
     constant = torch.ones(3000, 1)
     assert score(torch.cat([signal, constant], 1)) == pytest.approx(score(signal)), "what never varies does not count"
+    hardly = 0.01 * noise[:, :1]
+    assert score(torch.cat([signal, hardly], 1)) > 0.99 > score(hardly) + 0.9, "nor what hardly varies"
 
 
 def test_report_of_a_belief_that_knows_and_of_its_chance() -> None:
