@@ -73,19 +73,19 @@ class Args:
     action_lambda: float = 1.0
     """weight of the action head's loss"""
     fm_latent: Literal["mean", "sample"] = "mean"
-    """z that the action head gets: means of q; or samples of q (the paper's choice), mostly noise at first"""
+    """z in L_FM: the mean of q; or a sample of q, which is the paper's choice and mostly noise at first"""
     image_mask: float = 0.25
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
     occlusion: float = 0.5
     """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
     warmup_updates: int = 0
-    """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
+    """updates on single frames before those, with a teacher that knows u_0 for a memory; 0: none, as in the paper"""
     prior_nll: float = 0.0
     """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
 
 
-MAY_DIFFER = ()  # when a run is resumed
-TASKS = {}  # the paper has one setting of this stage for all tasks
+MAY_DIFFER = ()  # of open_run: arguments that may change when a run is resumed
+TASKS = {}  # of parse_args: defaults by task; the paper has one setting of this stage for all
 SMALL = dict(
     exp_name="aib_belief_small",
     num_updates=1500,
@@ -170,12 +170,14 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
 
-    The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
-    it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
-    A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are where
-    attention with constant queries looks among 32 x 32 blocks of pixels, as at a moving ball, which must be located
-    within a pixel (a spatial softmax, Levine et al., 2016).
-    The paper's history (E.2) has past actions, too: left out, as joints show them (a_t from joints at t and t + 1).
+    1. memory = code(state of the GRU before o_t), of which the first half asks.
+    2. A query made of that half attends to a grid of 16 x 16 patches of o_t, which gives a place: coordinates and
+       values. Keys hold no coordinates, so that layouts of scenes cannot be memorised. Where the attention is not sure,
+       as the arm hides the object, the place stays the one of the step before.
+    3. Constant queries attend to a grid of 32 x 32 finer blocks, which gives eight keypoints, as the place of a moving
+       ball (a spatial softmax, Levine et al., 2016).
+    4. h_t = MLP(memory, place, keypoints) + linear(joints). The GRU then gets place, keypoints and features of o_t.
+    Past actions (E.2) are not in the history: the action head reads a_t off the joints at t and t + 1.
     """
 
     def __init__(self, config: dict):
@@ -195,7 +197,7 @@ class HistoryEncoder(nn.Module):
         self.point_queries = nn.Parameter(torch.randn(8, 16))
         self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
-        self.sure = nn.Linear(1, 1)  # starts as sigmoid(10 (largest weight - 0.4))
+        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; begins to trust it at 0.4
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
         self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
@@ -227,13 +229,16 @@ class HistoryEncoder(nn.Module):
         return images.unfold(1, size, size).unfold(2, size, size).flatten(1, 2).flatten(2)
 
     def attend(self, queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N)."""
+        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
+
+        Logits of normalised queries and keys lie in [-16, 16], enough to choose one of a thousand: no 1 / sqrt(16).
+        """
         queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
         log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
         return log_weights.exp() @ contents, log_weights
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory (..., 32), whose first half asks -> the place (..., 10), log weights of the patches (..., N)."""
+        """Memory (..., 32), of which the first 16 ask -> place (..., 10), log weights of the patches (..., N)."""
         place, log_weights = self.attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
         return place.squeeze(-2), log_weights.squeeze(-2)
 
@@ -242,25 +247,32 @@ class HistoryEncoder(nn.Module):
         sure = self.sure(log_weights.exp().amax(-1, keepdim=True)).sigmoid()
         return before + sure * (place - before)
 
-    def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
-        """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
-        arm = self.arm((joints - self.joints_mean) / self.joints_std)
-        return self.out(torch.cat([memory, places], -1)) + arm
+    def step(
+        self, hidden: Tensor, place: Tensor, keys: Tensor, contents: Tensor, keypoints: Tensor, summary: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """One step of the recurrence: the GRU's state (B, 256) and the place (B, 10) before, and what look found.
 
-    def forward(self, rgb: Tensor, joints: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """One step: rgb (B, H, W, 3) uint8, joints (B, J), state before (None: 0) -> h (B, 256), state after.
-
-        The state is the GRU's and the place, (B, 256 + 10).
+        Returns memory (B, 32), embedded places (B, 64), and the GRU's state and the place after.
         """
-        if state is None:
-            state = joints.new_zeros(len(rgb), 256 + 10)
-        hidden, place = state.split([256, 10], -1)
-        keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
         place = self.keep(*self.ask(memory, keys, contents), place)
-        places = self.place(torch.cat([place, keypoints], -1))
-        hidden = self.gru(torch.cat([places, summary], -1), hidden)
-        return self.combine(memory, places, joints), torch.cat([hidden, place], -1)
+        embedded = self.place(torch.cat([place, keypoints], -1))
+        return memory, embedded, self.gru(torch.cat([embedded, summary], -1), hidden), place
+
+    def combine(self, memory: Tensor, embedded: Tensor, joints: Tensor) -> Tensor:
+        """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
+        arm = self.arm((joints - self.joints_mean) / self.joints_std)
+        return self.out(torch.cat([memory, embedded], -1)) + arm
+
+    def forward(self, rgb: Tensor, joints: Tensor, recurrent: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """One step: rgb (B, H, W, 3) uint8, joints (B, J), recurrent state before (None: 0) -> h (B, 256), and after.
+
+        The recurrent state is the GRU's and the place, (B, 256 + 10).
+        """
+        if recurrent is None:
+            recurrent = joints.new_zeros(len(rgb), 256 + 10)
+        memory, embedded, *after = self.step(*recurrent.split([256, 10], -1), *self.look(rgb))
+        return self.combine(memory, embedded, joints), torch.cat(after, -1)
 
 
 class Teacher(nn.Module):
@@ -268,7 +280,7 @@ class Teacher(nn.Module):
 
     def __init__(self, u_dim: int):
         super().__init__()
-        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)
+        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)  # as if each std were at least 0.05
         self.net = orthogonal_init(mlp([u_dim + 1, 64, 16]))
 
     def forward(self, u_0: Tensor, t: Tensor) -> Tensor:
@@ -326,23 +338,25 @@ def encode_history(
 
     teacher_memory (T+1, B, 16), if given, stands in h for the half of the memory that asks; the GRU keeps its own.
     """
+    num_steps, num_episodes = batch["rgb"].shape[:2]
     seen = [history.look(rgb, mask) for rgb in batch["rgb"].flatten(0, 1).split(IMAGE_CHUNK)]
     keys, contents, keypoints, summary = (
-        torch.cat(x).unflatten(0, batch["rgb"].shape[:2]) for x in zip(*seen, strict=True)
+        torch.cat(x).unflatten(0, (num_steps, num_episodes)) for x in zip(*seen, strict=True)
     )
-    hidden, memories, places = batch["joints"].new_zeros(keys.shape[1], 256), [], []
-    place = start = batch["joints"].new_zeros(keys.shape[1], 10)
-    for *patches, points, features in zip(keys, contents, keypoints, summary, strict=True):
-        memories.append(history.code(hidden))
-        place = history.keep(*history.ask(memories[-1], *patches), place)
-        places.append(history.place(torch.cat([place, points], -1)))
-        hidden = history.gru(torch.cat([places[-1], features], -1), hidden)
-    memory, places = torch.stack(memories), torch.stack(places)
+    hidden, memories, embedded = batch["joints"].new_zeros(num_episodes, 256), [], []
+    place = start = batch["joints"].new_zeros(num_episodes, 10)
+    for t in range(num_steps):
+        found = keys[t], contents[t], keypoints[t], summary[t]
+        memory, places, hidden, place = history.step(hidden, place, *found)
+        memories.append(memory)
+        embedded.append(places)
+    memory = torch.stack(memories)
     if teacher_memory is None:
-        return history.combine(memory, places, batch["joints"]), memory
+        return history.combine(memory, torch.stack(embedded), batch["joints"]), memory
     taught, place, kept = torch.cat([teacher_memory, memory[..., 16:]], -1), start, []
-    for found in zip(*history.ask(taught, keys, contents), strict=True):
-        place = history.keep(*found, place)
+    asked, log_weights = history.ask(taught, keys, contents)  # at all steps at once: only keep is recurrent
+    for t in range(num_steps):
+        place = history.keep(asked[t], log_weights[t], place)
         kept.append(place)
     places = history.place(torch.cat([torch.stack(kept), keypoints], -1))
     return history.combine(taught, places, batch["joints"]), memory
@@ -352,8 +366,10 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
 
     The teacher's memory, of the privileged state at the episode's start, asks in place of the GRU's (as the first
-    phase of Kumar et al., 2021). error: of u from z ~ p(z), mean of three. place: -log sum_i w_i N(u; locator(patch i))
-    over the attention's weights w_i, which tells it where u says that the object is; locator: its error of u.
+    phase of Kumar et al., 2021).
+    error: of u decoded with z from the prior, mean of three: of all that is known, of the place, of the keypoints.
+    place: -log sum_i w_i N(u; locator(patch i)) over the attention's weights w_i, which draws it to where u is told.
+    locator: error of u from the attended place, which trains the locator's mean.
     """
     belief, history, u = model["belief"], model["belief"].history, batch["u"]
     keys, contents, keypoints, _ = history.look(batch["rgb"], args.image_mask)
@@ -361,14 +377,14 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     memory = torch.cat([memory, torch.zeros_like(memory)], -1)
     place, log_weights = history.ask(memory, keys, contents)
     losses = {"error": 0.0}
-    # all that is known, then the place alone and keypoints alone: else nobody looks for what the memory knows
-    for knows_memory, knows_place, knows_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
-        places = history.place(torch.cat([knows_place * place, knows_keypoints * keypoints], -1))
-        h = history.combine(knows_memory * memory, places, history.joints_mean)  # joints would identify an episode
+    # the teacher's memory tells much of u: without passes that lack it the attention would not learn to look
+    for use_memory, use_place, use_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
+        places = history.place(torch.cat([use_place * place, use_keypoints * keypoints], -1))
+        h = history.combine(use_memory * memory, places, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
         losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
     located = model["locator"](contents)
-    # the locator's mean is fitted at the attended place alone: fitted here, it could place objects anywhere
+    # detached: trained on all patches, the locator would tell u of any of them, and the attention would learn nothing
     log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
     losses["locator"] = (model["locator"](place.detach()).mean - u).square().sum(-1).mean()
     losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
@@ -380,7 +396,8 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
 def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, rng: np.random.Generator) -> None:
     """In a share of episodes hide the place that the teacher asks for, from a random step on, as the arm hides objects.
 
-    Changes rgb (T+1, B, H, W, 3): a rectangle of one colour, as wide and high as a quarter to a half of the picture.
+    Changes rgb (T+1, B, H, W, 3), a copy of the dataset's: a rectangle of one colour, as wide and high as a quarter to
+    a half of the picture.
     """
     rgb, history = batch["rgb"], model["belief"].history
     episodes = np.flatnonzero(rng.random(rgb.shape[1]) < share)
@@ -394,7 +411,8 @@ def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, r
     centres = (place[:, :2].cpu().numpy() + 1) / 2 * size
     for step, episode, centre in zip(t, episodes, centres, strict=True):
         half = rng.integers(size // 8, size // 4)
-        (top, left), (bottom, right) = (centre - half).clip(0).astype(int), (centre + half).astype(int)
+        top, left = (centre - half).clip(0).astype(int)
+        bottom, right = (centre + half).astype(int)
         colour = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
         rgb[step:, episode, top:bottom, left:right] = colour
 
@@ -405,12 +423,14 @@ def history_losses(
     """h (T+1, B, 256) of whole episodes, and what trains it beside the ELBO; zeros where the arguments say so.
 
     prior_nll: -log p(u|z,h) with z from the prior. memory: 10 times its squared error from the teacher's.
-    teacher_acts: h is of the teacher's memory, the GRU's own only follows it.
+    teacher_acts: in h the teacher's memory takes the place of the GRU's, which learns to follow it.
     """
-    t = torch.arange(len(batch["u"]), device=batch["u"].device)
-    u_0 = batch["u"][0].expand_as(batch["u"])
-    teacher_memory = model["teacher"](u_0.flatten(0, 1), t.repeat_interleave(u_0.shape[1])).detach()
-    teacher_memory = teacher_memory.unflatten(0, u_0.shape[:2])
+    teacher_memory = None
+    if args.warmup_updates:  # the paper has no teacher
+        num_steps, num_episodes = batch["u"].shape[:2]
+        u_0 = batch["u"][0].expand_as(batch["u"]).flatten(0, 1)
+        t = torch.arange(num_steps, device=u_0.device).repeat_interleave(num_episodes)
+        teacher_memory = model["teacher"](u_0, t).detach().unflatten(0, (num_steps, num_episodes))
     h, memory = encode_history(
         model["belief"].history, batch, args.image_mask, teacher_memory if teacher_acts else None
     )
@@ -418,15 +438,15 @@ def history_losses(
     if args.prior_nll:
         decoded = model["belief"].decode(h, torch.randn(*h.shape[:-1], 1, args.z_dim, device=h.device))
         losses["prior_nll"] = -decoded.log_prob(batch["u"].unsqueeze(-2)).sum(-1).mean()
-    if args.warmup_updates:
+    if teacher_memory is not None:
         losses["memory"] = 10 * (memory[..., :16] - teacher_memory).square().sum(-1).mean()
     return h, losses
 
 
 def elbo_terms(belief: nn.Module, posterior: nn.Module, u: Tensor, h: Tensor) -> tuple[Tensor, ...]:
-    """The two terms of -L_VAE, and z: u (..., u_dim), h (..., 256) -> four tensors.
+    """The two terms of -L_VAE, of u (..., u_dim) and h (..., 256), and z.
 
-    -log p(u|z,h) (...,); KL(q || p) (...,); the sample z ~ q (..., z_dim) in the first; the mean of q (..., z_dim).
+    Returns -log p(u|z,h) at a sample z ~ q (...,), KL(q || p) (...,), that sample (..., z_dim), q's mean (..., z_dim).
     """
     q = posterior(torch.cat([u, h], -1))
     z = q.rsample()
@@ -454,9 +474,9 @@ def belief_losses(
     batch: of EpisodeDataset. --fm-latent: z in L_FM is q's mean, or a sample of q (the paper's choice).
     --action-head mse: the squared error of the predicted action in place of L_FM; none: neither.
     """
-    h, history = history_losses(model, batch, args, teacher_acts)
+    h, other_losses = history_losses(model, batch, args, teacher_acts)
     nll, kl, z_sample, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
-    losses = {"nll": nll.mean(), "kl": kl.mean(), **history}
+    losses = {"nll": nll.mean(), "kl": kl.mean(), **other_losses}
     losses["total"] = losses["nll"] + args.beta * losses["kl"] + args.prior_nll * losses["prior_nll"] + losses["memory"]
     if args.action_head != "none":
         latent = z_mean if args.fm_latent == "mean" else z_sample
@@ -479,7 +499,7 @@ class EpisodeDataset:
     def __init__(self, dataset: Path, u: Tensor, device: str):
         self.device, self.arrays = device, {"u": u.to(device)}
         for name in ("rgb", "joints", "actions"):
-            x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of read-only arrays
+            x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of "r", read-only
             fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
             self.arrays[name] = x.to(device) if fits else x
 
@@ -561,7 +581,7 @@ def main(args: Args) -> None:
     }
     torch.manual_seed(args.seed)
     model = nn.ModuleDict({"belief": AIBBelief(config)})
-    # PPO needs neither posterior nor head: belief.pt goes without them
+    # belief.pt holds the belief alone; all else serves its training
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     model["teacher"], model["locator"] = Teacher(config["u_dim"]), Locator(config["u_dim"])
     if args.action_head != "none":
@@ -593,7 +613,7 @@ def main(args: Args) -> None:
         model["teacher"].train(progress < 0)
         if progress < 0:
             episode = rng.choice(train, 8 * args.batch_episodes)
-            # early steps more often, as they show what is to be remembered
+            # early steps more often (density t^(-1/3)), as they show what is to be remembered
             t = (len(sample["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
             frames = episodes.frames(episode, t)
             losses = warmup_losses(model, frames, args)
@@ -620,11 +640,11 @@ def main(args: Args) -> None:
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "checkpoint.pt", checkpoint)
 
-    # no early stopping: held-out error and likelihood are best before h holds the cue
+    # the last weights, not the best on held-out episodes: those are from before the cue can be read from h
     content = {**asdict(args), "config": config}
     content |= {name: stored[name] for name in ("robot_triangles", "image_size")}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
-    u, estimate = validate_belief(model["belief"], episodes, held_out)
+    u, estimate = validate_belief(model["belief"], episodes, held_out)  # again: a resumed run may skip the loop
     for t in range(len(u)):
         writer.add_scalar("belief/held_out_u_r2_by_step", r_squared(u[t], estimate[t]), t)
     writer.close()

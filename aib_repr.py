@@ -422,8 +422,8 @@ class PrivilegedInfoWrapper(gym.Wrapper):
 
     The task is made with obs_mode state_dict, and _view adds the picture.
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all that the task's _get_obs_extra
-    returns but the tool's pose; in MIKASA's tasks the cue is in it.
+    Info, privileged, of which PPO reads success alone: success (B,); cue (B, K), the memory variable; state (B, D), all
+    that the task's _get_obs_extra returns but the tool's pose; in MIKASA's tasks the cue is in it.
     """
 
     def __init__(self, env: gym.Env):
@@ -432,8 +432,8 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         self.poses = {}
         task_evaluate = self.task.evaluate
 
-        # ManiSkill calls evaluate after the physics and before the picture. MIKASA's tasks hide objects there, at
-        # z = 1000. On physx_cpu they would stay there: note their poses; _view takes the picture and restores them.
+        # MIKASA's evaluate hides objects for the picture by moving them to z = 1000. On physx_cpu they would not come
+        # back before the next step's physics: note the poses before it; _view puts them back after the picture.
         def evaluate_and_note_poses() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
@@ -527,7 +527,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker: of the CPU renderer and of torch
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")

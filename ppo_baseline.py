@@ -44,7 +44,7 @@ CUDA = torch.cuda.is_available()
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
     BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
-# seeds: PPO < 2**30 <= stage 1 < EVAL_SEED <= evaluations < TEST_SEED <= --evaluate
+# seeds of episodes: PPO's below 2**30, then stage 1's, evaluations' from EVAL_SEED on, --evaluate's from TEST_SEED on
 EVAL_SEED = 2**30 + 2**29
 TEST_SEED = EVAL_SEED + 2**20
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -81,7 +81,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training; a finished run goes on with a larger number"""
     num_envs: int = 256
-    """episodes per iteration, not the number of processes; on physx_cuda all begin with one arm pose"""
+    """whole episodes per iteration, each of the task's length; on physx_cuda they begin with one arm pose"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
     cnn_lr_scale: float = 1.0
@@ -105,7 +105,7 @@ class Args:
     max_grad_norm: float = 0.5
     """largest norm of the gradient"""
     target_kl: float = 0.05
-    """the update ends before the first minibatch whose approx_kl is larger"""
+    """the update ends before the first minibatch whose approx_kl is larger; inf: never"""
     eval_every: int = 25
     """iterations between evaluations"""
     num_eval_episodes: int = 192
@@ -290,7 +290,7 @@ def rollout(
     desc = "evaluation" if deterministic else "rollout"
     for first in range(0, num_episodes, envs.num_envs):
         last = min(first + envs.num_envs, num_episodes)
-        # the last round is filled up with repeated episodes, which are not kept
+        # the simulator always plays envs.num_envs: the last round repeats episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
         obs, _ = envs.reset(seed=seeds[rows].tolist())
         for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
@@ -324,8 +324,8 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
     rgb = buffer["rgb"][:, :4].cpu().numpy().copy()  # (T, 4, H, W, 3)
-    succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
-    rgb[1:, :, :4][succeeded] = (0, 255, 0)  # the top 4 rows of pixels
+    steps, episodes = np.nonzero(buffer["success"][:-1, :4].cpu().numpy())
+    rgb[steps + 1, episodes, :4] = (0, 255, 0)  # success after step t shows in frame t + 1, in 4 rows of pixels
     rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)
     size = ["-vf", "scale=-2:256:flags=neighbor"]  # 256 pixels high; -2: width in proportion, rounded to even
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1, output_params=size)
@@ -408,9 +408,10 @@ def main(args: Args) -> None:
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
 
         values, rewards = buffer.pop("values"), buffer["rewards"]  # values has T+1 steps: not for the batch
-        if args.reward_norm:  # with values 0 and lambda 1 compute_gae gives the discounted sums of the rewards to come
+        if args.reward_norm:
+            # discounted sums of the rewards to come are what compute_gae gives for values of 0 and lambda 1
             sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
-            reward_var += (sums.var().item() - reward_var) / iteration  # mean over iterations
+            reward_var += (sums.var().item() - reward_var) / iteration  # the mean of all iterations' variances
             rewards = rewards / (reward_var + 1e-8) ** 0.5
         buffer["advantages"] = compute_gae(rewards, values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
@@ -474,8 +475,8 @@ class PrivilegedInfoWrapper(gym.Wrapper):
 
     The task is made with obs_mode state_dict, and _view adds the picture.
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all that the task's _get_obs_extra
-    returns but the tool's pose; in MIKASA's tasks the cue is in it.
+    Info, privileged, of which PPO reads success alone: success (B,); cue (B, K), the memory variable; state (B, D), all
+    that the task's _get_obs_extra returns but the tool's pose; in MIKASA's tasks the cue is in it.
     """
 
     def __init__(self, env: gym.Env):
@@ -484,8 +485,8 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         self.poses = {}
         task_evaluate = self.task.evaluate
 
-        # ManiSkill calls evaluate after the physics and before the picture. MIKASA's tasks hide objects there, at
-        # z = 1000. On physx_cpu they would stay there: note their poses; _view takes the picture and restores them.
+        # MIKASA's evaluate hides objects for the picture by moving them to z = 1000. On physx_cpu they would not come
+        # back before the next step's physics: note the poses before it; _view puts them back after the picture.
         def evaluate_and_note_poses() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
@@ -579,7 +580,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker: of the CPU renderer and of torch
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")

@@ -52,7 +52,7 @@ IMAGE_CHUNK = 4096 if CUDA else 64  # images through the history encoder at a ti
 BFLOAT16 = "bf16" in Path("/proc/cpuinfo").read_text()
 if CUDA:
     BFLOAT16 = torch.cuda.is_bf16_supported(including_emulation=False)
-# seeds: PPO < 2**30 <= stage 1 < EVAL_SEED <= evaluations < TEST_SEED <= --evaluate
+# seeds of episodes: PPO's below 2**30, then stage 1's, evaluations' from EVAL_SEED on, --evaluate's from TEST_SEED on
 EVAL_SEED = 2**30 + 2**29
 TEST_SEED = EVAL_SEED + 2**20
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
@@ -103,7 +103,7 @@ class Args:
     occlusion: float = 0.5
     """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
     warmup_updates: int = 0
-    """updates on 8 x batch_episodes single frames before those, with a memory made of u_0; 0: none, as in the paper"""
+    """updates on single frames before those, with a teacher that knows u_0 for a memory; 0: none, as in the paper"""
     prior_nll: float = 0.0
     """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
 
@@ -114,7 +114,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training; a finished run goes on with a larger number"""
     num_envs: int = 256
-    """episodes per iteration, not the number of processes; on physx_cuda all begin with one arm pose"""
+    """whole episodes per iteration, each of the task's length; on physx_cuda they begin with one arm pose"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
     cnn_lr_scale: float = 1.0
@@ -138,7 +138,7 @@ class Args:
     max_grad_norm: float = 0.5
     """largest norm of the gradient"""
     target_kl: float = 0.05
-    """the update ends before the first minibatch whose approx_kl is larger"""
+    """the update ends before the first minibatch whose approx_kl is larger; inf: never"""
     eval_every: int = 25
     """iterations between evaluations"""
     num_eval_episodes: int = 192
@@ -269,12 +269,14 @@ class StateEncoder(nn.Module):
 class HistoryEncoder(nn.Module):
     """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
 
-    The GRU's state before the present picture says what to look for, attention over the picture's 16 x 16 patches where
-    it is. Keys say what a patch looks like and hold no coordinates, so that layouts of scenes cannot be memorised.
-    A place that the attention is no longer sure of, as the arm hides it, stays the one before. Keypoints are where
-    attention with constant queries looks among 32 x 32 blocks of pixels, as at a moving ball, which must be located
-    within a pixel (a spatial softmax, Levine et al., 2016).
-    The paper's history (E.2) has past actions, too: left out, as joints show them (a_t from joints at t and t + 1).
+    1. memory = code(state of the GRU before o_t), of which the first half asks.
+    2. A query made of that half attends to a grid of 16 x 16 patches of o_t, which gives a place: coordinates and
+       values. Keys hold no coordinates, so that layouts of scenes cannot be memorised. Where the attention is not sure,
+       as the arm hides the object, the place stays the one of the step before.
+    3. Constant queries attend to a grid of 32 x 32 finer blocks, which gives eight keypoints, as the place of a moving
+       ball (a spatial softmax, Levine et al., 2016).
+    4. h_t = MLP(memory, place, keypoints) + linear(joints). The GRU then gets place, keypoints and features of o_t.
+    Past actions (E.2) are not in the history: the action head reads a_t off the joints at t and t + 1.
     """
 
     def __init__(self, config: dict):
@@ -294,7 +296,7 @@ class HistoryEncoder(nn.Module):
         self.point_queries = nn.Parameter(torch.randn(8, 16))
         self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
-        self.sure = nn.Linear(1, 1)  # starts as sigmoid(10 (largest weight - 0.4))
+        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; begins to trust it at 0.4
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
         self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
@@ -326,13 +328,16 @@ class HistoryEncoder(nn.Module):
         return images.unfold(1, size, size).unfold(2, size, size).flatten(1, 2).flatten(2)
 
     def attend(self, queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N)."""
+        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
+
+        Logits of normalised queries and keys lie in [-16, 16], enough to choose one of a thousand: no 1 / sqrt(16).
+        """
         queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
         log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
         return log_weights.exp() @ contents, log_weights
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory (..., 32), whose first half asks -> the place (..., 10), log weights of the patches (..., N)."""
+        """Memory (..., 32), of which the first 16 ask -> place (..., 10), log weights of the patches (..., N)."""
         place, log_weights = self.attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
         return place.squeeze(-2), log_weights.squeeze(-2)
 
@@ -341,25 +346,32 @@ class HistoryEncoder(nn.Module):
         sure = self.sure(log_weights.exp().amax(-1, keepdim=True)).sigmoid()
         return before + sure * (place - before)
 
-    def combine(self, memory: Tensor, places: Tensor, joints: Tensor) -> Tensor:
-        """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
-        arm = self.arm((joints - self.joints_mean) / self.joints_std)
-        return self.out(torch.cat([memory, places], -1)) + arm
+    def step(
+        self, hidden: Tensor, place: Tensor, keys: Tensor, contents: Tensor, keypoints: Tensor, summary: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """One step of the recurrence: the GRU's state (B, 256) and the place (B, 10) before, and what look found.
 
-    def forward(self, rgb: Tensor, joints: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """One step: rgb (B, H, W, 3) uint8, joints (B, J), state before (None: 0) -> h (B, 256), state after.
-
-        The state is the GRU's and the place, (B, 256 + 10).
+        Returns memory (B, 32), embedded places (B, 64), and the GRU's state and the place after.
         """
-        if state is None:
-            state = joints.new_zeros(len(rgb), 256 + 10)
-        hidden, place = state.split([256, 10], -1)
-        keys, contents, keypoints, summary = self.look(rgb)
         memory = self.code(hidden)
         place = self.keep(*self.ask(memory, keys, contents), place)
-        places = self.place(torch.cat([place, keypoints], -1))
-        hidden = self.gru(torch.cat([places, summary], -1), hidden)
-        return self.combine(memory, places, joints), torch.cat([hidden, place], -1)
+        embedded = self.place(torch.cat([place, keypoints], -1))
+        return memory, embedded, self.gru(torch.cat([embedded, summary], -1), hidden), place
+
+    def combine(self, memory: Tensor, embedded: Tensor, joints: Tensor) -> Tensor:
+        """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
+        arm = self.arm((joints - self.joints_mean) / self.joints_std)
+        return self.out(torch.cat([memory, embedded], -1)) + arm
+
+    def forward(self, rgb: Tensor, joints: Tensor, recurrent: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """One step: rgb (B, H, W, 3) uint8, joints (B, J), recurrent state before (None: 0) -> h (B, 256), and after.
+
+        The recurrent state is the GRU's and the place, (B, 256 + 10).
+        """
+        if recurrent is None:
+            recurrent = joints.new_zeros(len(rgb), 256 + 10)
+        memory, embedded, *after = self.step(*recurrent.split([256, 10], -1), *self.look(rgb))
+        return self.combine(memory, embedded, joints), torch.cat(after, -1)
 
 
 class Teacher(nn.Module):
@@ -367,7 +379,7 @@ class Teacher(nn.Module):
 
     def __init__(self, u_dim: int):
         super().__init__()
-        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)
+        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)  # as if each std were at least 0.05
         self.net = orthogonal_init(mlp([u_dim + 1, 64, 16]))
 
     def forward(self, u_0: Tensor, t: Tensor) -> Tensor:
@@ -451,23 +463,25 @@ def encode_history(
 
     teacher_memory (T+1, B, 16), if given, stands in h for the half of the memory that asks; the GRU keeps its own.
     """
+    num_steps, num_episodes = batch["rgb"].shape[:2]
     seen = [history.look(rgb, mask) for rgb in batch["rgb"].flatten(0, 1).split(IMAGE_CHUNK)]
     keys, contents, keypoints, summary = (
-        torch.cat(x).unflatten(0, batch["rgb"].shape[:2]) for x in zip(*seen, strict=True)
+        torch.cat(x).unflatten(0, (num_steps, num_episodes)) for x in zip(*seen, strict=True)
     )
-    hidden, memories, places = batch["joints"].new_zeros(keys.shape[1], 256), [], []
-    place = start = batch["joints"].new_zeros(keys.shape[1], 10)
-    for *patches, points, features in zip(keys, contents, keypoints, summary, strict=True):
-        memories.append(history.code(hidden))
-        place = history.keep(*history.ask(memories[-1], *patches), place)
-        places.append(history.place(torch.cat([place, points], -1)))
-        hidden = history.gru(torch.cat([places[-1], features], -1), hidden)
-    memory, places = torch.stack(memories), torch.stack(places)
+    hidden, memories, embedded = batch["joints"].new_zeros(num_episodes, 256), [], []
+    place = start = batch["joints"].new_zeros(num_episodes, 10)
+    for t in range(num_steps):
+        found = keys[t], contents[t], keypoints[t], summary[t]
+        memory, places, hidden, place = history.step(hidden, place, *found)
+        memories.append(memory)
+        embedded.append(places)
+    memory = torch.stack(memories)
     if teacher_memory is None:
-        return history.combine(memory, places, batch["joints"]), memory
+        return history.combine(memory, torch.stack(embedded), batch["joints"]), memory
     taught, place, kept = torch.cat([teacher_memory, memory[..., 16:]], -1), start, []
-    for found in zip(*history.ask(taught, keys, contents), strict=True):
-        place = history.keep(*found, place)
+    asked, log_weights = history.ask(taught, keys, contents)  # at all steps at once: only keep is recurrent
+    for t in range(num_steps):
+        place = history.keep(asked[t], log_weights[t], place)
         kept.append(place)
     places = history.place(torch.cat([torch.stack(kept), keypoints], -1))
     return history.combine(taught, places, batch["joints"]), memory
@@ -477,8 +491,10 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
 
     The teacher's memory, of the privileged state at the episode's start, asks in place of the GRU's (as the first
-    phase of Kumar et al., 2021). error: of u from z ~ p(z), mean of three. place: -log sum_i w_i N(u; locator(patch i))
-    over the attention's weights w_i, which tells it where u says that the object is; locator: its error of u.
+    phase of Kumar et al., 2021).
+    error: of u decoded with z from the prior, mean of three: of all that is known, of the place, of the keypoints.
+    place: -log sum_i w_i N(u; locator(patch i)) over the attention's weights w_i, which draws it to where u is told.
+    locator: error of u from the attended place, which trains the locator's mean.
     """
     belief, history, u = model["belief"], model["belief"].history, batch["u"]
     keys, contents, keypoints, _ = history.look(batch["rgb"], args.image_mask)
@@ -486,14 +502,14 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     memory = torch.cat([memory, torch.zeros_like(memory)], -1)
     place, log_weights = history.ask(memory, keys, contents)
     losses = {"error": 0.0}
-    # all that is known, then the place alone and keypoints alone: else nobody looks for what the memory knows
-    for knows_memory, knows_place, knows_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
-        places = history.place(torch.cat([knows_place * place, knows_keypoints * keypoints], -1))
-        h = history.combine(knows_memory * memory, places, history.joints_mean)  # joints would identify an episode
+    # the teacher's memory tells much of u: without passes that lack it the attention would not learn to look
+    for use_memory, use_place, use_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
+        places = history.place(torch.cat([use_place * place, use_keypoints * keypoints], -1))
+        h = history.combine(use_memory * memory, places, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
         losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
     located = model["locator"](contents)
-    # the locator's mean is fitted at the attended place alone: fitted here, it could place objects anywhere
+    # detached: trained on all patches, the locator would tell u of any of them, and the attention would learn nothing
     log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
     losses["locator"] = (model["locator"](place.detach()).mean - u).square().sum(-1).mean()
     losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
@@ -505,7 +521,8 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
 def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, rng: np.random.Generator) -> None:
     """In a share of episodes hide the place that the teacher asks for, from a random step on, as the arm hides objects.
 
-    Changes rgb (T+1, B, H, W, 3): a rectangle of one colour, as wide and high as a quarter to a half of the picture.
+    Changes rgb (T+1, B, H, W, 3), a copy of the dataset's: a rectangle of one colour, as wide and high as a quarter to
+    a half of the picture.
     """
     rgb, history = batch["rgb"], model["belief"].history
     episodes = np.flatnonzero(rng.random(rgb.shape[1]) < share)
@@ -519,7 +536,8 @@ def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, r
     centres = (place[:, :2].cpu().numpy() + 1) / 2 * size
     for step, episode, centre in zip(t, episodes, centres, strict=True):
         half = rng.integers(size // 8, size // 4)
-        (top, left), (bottom, right) = (centre - half).clip(0).astype(int), (centre + half).astype(int)
+        top, left = (centre - half).clip(0).astype(int)
+        bottom, right = (centre + half).astype(int)
         colour = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
         rgb[step:, episode, top:bottom, left:right] = colour
 
@@ -530,12 +548,14 @@ def history_losses(
     """h (T+1, B, 256) of whole episodes, and what trains it beside the ELBO; zeros where the arguments say so.
 
     prior_nll: -log p(u|z,h) with z from the prior. memory: 10 times its squared error from the teacher's.
-    teacher_acts: h is of the teacher's memory, the GRU's own only follows it.
+    teacher_acts: in h the teacher's memory takes the place of the GRU's, which learns to follow it.
     """
-    t = torch.arange(len(batch["u"]), device=batch["u"].device)
-    u_0 = batch["u"][0].expand_as(batch["u"])
-    teacher_memory = model["teacher"](u_0.flatten(0, 1), t.repeat_interleave(u_0.shape[1])).detach()
-    teacher_memory = teacher_memory.unflatten(0, u_0.shape[:2])
+    teacher_memory = None
+    if args.warmup_updates:  # the paper has no teacher
+        num_steps, num_episodes = batch["u"].shape[:2]
+        u_0 = batch["u"][0].expand_as(batch["u"]).flatten(0, 1)
+        t = torch.arange(num_steps, device=u_0.device).repeat_interleave(num_episodes)
+        teacher_memory = model["teacher"](u_0, t).detach().unflatten(0, (num_steps, num_episodes))
     h, memory = encode_history(
         model["belief"].history, batch, args.image_mask, teacher_memory if teacher_acts else None
     )
@@ -543,7 +563,7 @@ def history_losses(
     if args.prior_nll:
         decoded = model["belief"].decode(h, torch.randn(*h.shape[:-1], 1, args.z_dim, device=h.device))
         losses["prior_nll"] = -decoded.log_prob(batch["u"].unsqueeze(-2)).sum(-1).mean()
-    if args.warmup_updates:
+    if teacher_memory is not None:
         losses["memory"] = 10 * (memory[..., :16] - teacher_memory).square().sum(-1).mean()
     return h, losses
 
@@ -603,7 +623,7 @@ class EpisodeDataset:
     def __init__(self, dataset: Path, u: Tensor, device: str):
         self.device, self.arrays = device, {"u": u.to(device)}
         for name in ("rgb", "joints", "actions"):
-            x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of read-only arrays
+            x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of "r", read-only
             fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
             self.arrays[name] = x.to(device) if fits else x
 
@@ -674,15 +694,15 @@ def rollout(
     desc = "evaluation" if deterministic else "rollout"
     for first in range(0, num_episodes, envs.num_envs):
         last = min(first + envs.num_envs, num_episodes)
-        # the last round is filled up with repeated episodes, which are not kept
+        # the simulator always plays envs.num_envs: the last round repeats episodes, which are not kept
         rows = np.arange(first, first + envs.num_envs) % num_episodes
         obs, _ = envs.reset(seed=seeds[rows].tolist())
-        hidden = None
+        recurrent = None
         for t in tqdm(range(steps + 1), f"{desc}, episode {first} of {num_episodes}", unit="step", leave=False):
             transition = {name: torch.as_tensor(obs[name], device=device) for name in ("rgb", "joints")}
-            h, hidden = agent.belief.history(transition["rgb"], transition["joints"], hidden)
+            h, recurrent = agent.belief.history(transition["rgb"], transition["joints"], recurrent)
             p_u = agent.belief.decode(h, z_noise[t, rows])
-            # kept for the update: fresh particles would change its probability ratio
+            # samples of p(u|z,h), as in the authors' code; kept, as fresh ones would change the update's ratio
             transition["particles"] = p_u.mean + p_u.stddev * u_noise[t, rows]
             dist, values = agent(transition)
             buffer["values"][t, first:last] = values[: last - first]
@@ -731,8 +751,8 @@ def success_and_return(buffer: dict[str, Tensor]) -> dict[str, float]:
 def make_video(buffer: dict[str, Tensor]) -> bytes:
     """What the agent's camera saw in a rollout's first 4 episodes, as mp4; a green bar marks success."""
     rgb = buffer["rgb"][:, :4].cpu().numpy().copy()  # (T, 4, H, W, 3)
-    succeeded = buffer["success"][:-1, :4].bool().cpu().numpy()  # after step t: what frame t + 1 shows
-    rgb[1:, :, :4][succeeded] = (0, 255, 0)  # the top 4 rows of pixels
+    steps, episodes = np.nonzero(buffer["success"][:-1, :4].cpu().numpy())
+    rgb[steps + 1, episodes, :4] = (0, 255, 0)  # success after step t shows in frame t + 1, in 4 rows of pixels
     rgb = np.concatenate(rgb.swapaxes(0, 1), axis=2)
     size = ["-vf", "scale=-2:256:flags=neighbor"]  # 256 pixels high; -2: width in proportion, rounded to even
     return iio.imwrite("<bytes>", rgb, extension=".mp4", fps=20, macro_block_size=1, output_params=size)
@@ -798,7 +818,7 @@ def train_belief(args: Args, path: Path) -> None:
         model["teacher"].train(progress < 0)
         if progress < 0:
             episode = rng.choice(train, 8 * args.batch_episodes)
-            # early steps more often, as they show what is to be remembered
+            # early steps more often (density t^(-1/3)), as they show what is to be remembered
             t = (len(sample["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
             frames = episodes.frames(episode, t)
             losses = warmup_losses(model, frames, args)
@@ -909,9 +929,10 @@ def main(args: Args) -> None:
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
 
         values, rewards = buffer.pop("values"), buffer["rewards"]  # values has T+1 steps: not for the batch
-        if args.reward_norm:  # with values 0 and lambda 1 compute_gae gives the discounted sums of the rewards to come
+        if args.reward_norm:
+            # discounted sums of the rewards to come are what compute_gae gives for values of 0 and lambda 1
             sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
-            reward_var += (sums.var().item() - reward_var) / iteration  # mean over iterations
+            reward_var += (sums.var().item() - reward_var) / iteration  # the mean of all iterations' variances
             rewards = rewards / (reward_var + 1e-8) ** 0.5
         buffer["advantages"] = compute_gae(rewards, values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
@@ -976,8 +997,8 @@ class PrivilegedInfoWrapper(gym.Wrapper):
 
     The task is made with obs_mode state_dict, and _view adds the picture.
     Observation: rgb (B, H, W, 3) uint8 of the base camera; joints (B, 25): 9 positions, 9 velocities, tool pose (7).
-    Info, privileged: success (B,); cue (B, K), the memory variable; state (B, D), all that the task's _get_obs_extra
-    returns but the tool's pose; in MIKASA's tasks the cue is in it.
+    Info, privileged, of which PPO reads success alone: success (B,); cue (B, K), the memory variable; state (B, D), all
+    that the task's _get_obs_extra returns but the tool's pose; in MIKASA's tasks the cue is in it.
     """
 
     def __init__(self, env: gym.Env):
@@ -986,8 +1007,8 @@ class PrivilegedInfoWrapper(gym.Wrapper):
         self.poses = {}
         task_evaluate = self.task.evaluate
 
-        # ManiSkill calls evaluate after the physics and before the picture. MIKASA's tasks hide objects there, at
-        # z = 1000. On physx_cpu they would stay there: note their poses; _view takes the picture and restores them.
+        # MIKASA's evaluate hides objects for the picture by moving them to z = 1000. On physx_cpu they would not come
+        # back before the next step's physics: note the poses before it; _view puts them back after the picture.
         def evaluate_and_note_poses() -> dict:
             self.poses = {actor: actor.pose.raw_pose.clone() for actor in self.task.scene.actors.values()}
             return task_evaluate()
@@ -1081,7 +1102,7 @@ def make_envs(args: Args) -> gym.vector.VectorEnv:
     """
     if args.sim_backend == "physx_cuda":
         return ManiSkillVectorEnv(make_task(args, args.num_envs), auto_reset=False, ignore_terminations=True)
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker
+    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1")  # of each worker: of the CPU renderer and of torch
     workers = [lambda: make_task(args, 1)] * min(args.num_workers, args.num_envs)
     multiprocessing.set_forkserver_preload(["torch", "mikasa_robo_suite.rl.memory_envs"])
     envs = gym.vector.AsyncVectorEnv(workers, context="spawn" if CUDA else "forkserver", autoreset_mode="Disabled")
