@@ -71,14 +71,14 @@ class Args:
     num_workers: int = 16 if CUDA else min(16, 2 * len(os.sched_getaffinity(0)))
     """simulator processes on physx_cpu, each 0.7 GB of memory; results depend on it by float rounding only"""
     small: bool = False
-    """a reduced setting for a CPU: by estimate 2 hours for all stages of RememberColor3-v0 on one core"""
+    """a reduced setting for a CPU: about 2.5 hours for all stages of RememberColor9-v0 on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 
     num_envs: int = 50
     """at most this many scenes at a time; physx_cuda draws one arm pose for all of them"""
     num_episodes: int = 2000
-    """episodes of the random policy; 640 are enough for RememberColor3-v0, not for harder tasks"""
+    """episodes of the random policy"""
     epochs: int = 200
     """passes over the training transitions"""
     batch_size: int = 500
@@ -106,7 +106,7 @@ TASKS = {}  # the paper has one setting of this stage for all tasks
 SMALL = dict(
     exp_name="aib_repr_small",
     num_envs=32,
-    num_episodes=640,
+    num_episodes=4000,
     image_size=64,
     epochs=7,
     batch_size=100,
