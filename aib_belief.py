@@ -275,30 +275,6 @@ class HistoryEncoder(nn.Module):
         return self.combine(memory, embedded, joints), torch.cat(after, -1)
 
 
-class Teacher(nn.Module):
-    """What to remember at step t, told by the first privileged state: u_0 (B, u_dim), t (B,) -> memory (B, 16)."""
-
-    def __init__(self, u_dim: int):
-        super().__init__()
-        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)  # as if each std were at least 0.05
-        self.net = orthogonal_init(mlp([u_dim + 1, 64, 16]))
-
-    def forward(self, u_0: Tensor, t: Tensor) -> Tensor:
-        return self.net(torch.cat([self.standardise(u_0), t.log1p().unsqueeze(-1)], -1))
-
-
-class Locator(nn.Module):
-    """What u is if a patch shows the object: contents (..., 10) -> Normal over u (..., u_dim), one std for all."""
-
-    def __init__(self, u_dim: int):
-        super().__init__()
-        self.mean = orthogonal_init(mlp([2 + 8, 64, u_dim]))
-        self.raw_std = nn.Parameter(torch.zeros(u_dim))
-
-    def forward(self, contents: Tensor) -> Normal:
-        return Normal(self.mean(contents), nn.functional.softplus(self.raw_std) + 0.1, validate_args=False)
-
-
 def chrono_init(gru: nn.GRUCell, steps: int) -> None:
     """Let the GRU begin with time constants of 2 to steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
     # PyTorch's order is reset, update, new; h' = (1 - update) * new + update * h
@@ -360,6 +336,81 @@ def encode_history(
         kept.append(place)
     places = history.place(torch.cat([torch.stack(kept), keypoints], -1))
     return history.combine(taught, places, batch["joints"]), memory
+
+
+def elbo_terms(belief: nn.Module, posterior: nn.Module, u: Tensor, h: Tensor) -> tuple[Tensor, ...]:
+    """The two terms of -L_VAE, of u (..., u_dim) and h (..., 256), and z.
+
+    Returns -log p(u|z,h) at a sample z ~ q (...,), KL(q || p) (...,), that sample (..., z_dim), q's mean (..., z_dim).
+    """
+    q = posterior(torch.cat([u, h], -1))
+    z = q.rsample()
+    nll = -belief.decoder(torch.cat([z, h], -1)).log_prob(u).sum(-1)
+    return nll, kl_divergence(q, belief.prior(h)).sum(-1), z, q.mean
+
+
+def flow_matching_loss(
+    head: nn.Module, action: Tensor, z: Tensor, z_next: Tensor, noise: Tensor, tau: Tensor
+) -> Tensor:
+    """L_FM at each step (...,): the velocity at a_tau = (1 - tau) a_0 + tau a_1 against a_1 - a_0.
+
+    action a_1 and noise a_0 (..., A); z and z_next (..., z_dim); tau (..., 1) in [0, 1].
+    """
+    a_tau = (1 - tau) * noise + tau * action
+    velocity = head(torch.cat([a_tau, tau, z, z_next], -1))
+    return (velocity - (action - noise)).square().sum(-1)
+
+
+def belief_losses(
+    model: nn.ModuleDict, batch: dict[str, Tensor], args: Args, teacher_acts: bool = False
+) -> dict[str, Tensor]:
+    """L_Total = -L_VAE + lambda L_FM, with the KL in L_VAE weighted by beta, and its terms; means over the batch.
+
+    batch: of EpisodeDataset. --fm-latent: z in L_FM is q's mean, or a sample of q (the paper's choice).
+    --action-head mse: the squared error of the predicted action in place of L_FM; none: neither.
+    """
+    h, other_losses = history_losses(model, batch, args, teacher_acts)
+    nll, kl, z_sample, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
+    losses = {"nll": nll.mean(), "kl": kl.mean(), **other_losses}
+    losses["total"] = losses["nll"] + args.beta * losses["kl"] + args.prior_nll * losses["prior_nll"] + losses["memory"]
+    if args.action_head != "none":
+        latent = z_mean if args.fm_latent == "mean" else z_sample
+        action, z, z_next = batch["actions"], latent[:-1], latent[1:]
+        if args.action_head == "flow":
+            noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
+            losses["action"] = flow_matching_loss(model["head"], action, z, z_next, noise, tau).mean()
+        else:
+            losses["action"] = (model["head"](torch.cat([z, z_next], -1)) - action).square().sum(-1).mean()
+        losses["total"] = losses["total"] + args.action_lambda * losses["action"]
+    return losses
+
+
+# ---------------------------------------------------------------- warm-up
+# not in the paper, and off unless --warmup-updates is given, as by --small: how attention learns to find objects
+
+
+class Teacher(nn.Module):
+    """What to remember at step t, told by the first privileged state: u_0 (B, u_dim), t (B,) -> memory (B, 16)."""
+
+    def __init__(self, u_dim: int):
+        super().__init__()
+        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)  # as if each std were at least 0.05
+        self.net = orthogonal_init(mlp([u_dim + 1, 64, 16]))
+
+    def forward(self, u_0: Tensor, t: Tensor) -> Tensor:
+        return self.net(torch.cat([self.standardise(u_0), t.log1p().unsqueeze(-1)], -1))
+
+
+class Locator(nn.Module):
+    """What u is if a patch shows the object: contents (..., 10) -> Normal over u (..., u_dim), one std for all."""
+
+    def __init__(self, u_dim: int):
+        super().__init__()
+        self.mean = orthogonal_init(mlp([2 + 8, 64, u_dim]))
+        self.raw_std = nn.Parameter(torch.zeros(u_dim))
+
+    def forward(self, contents: Tensor) -> Normal:
+        return Normal(self.mean(contents), nn.functional.softplus(self.raw_std) + 0.1, validate_args=False)
 
 
 def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
@@ -443,53 +494,6 @@ def history_losses(
     return h, losses
 
 
-def elbo_terms(belief: nn.Module, posterior: nn.Module, u: Tensor, h: Tensor) -> tuple[Tensor, ...]:
-    """The two terms of -L_VAE, of u (..., u_dim) and h (..., 256), and z.
-
-    Returns -log p(u|z,h) at a sample z ~ q (...,), KL(q || p) (...,), that sample (..., z_dim), q's mean (..., z_dim).
-    """
-    q = posterior(torch.cat([u, h], -1))
-    z = q.rsample()
-    nll = -belief.decoder(torch.cat([z, h], -1)).log_prob(u).sum(-1)
-    return nll, kl_divergence(q, belief.prior(h)).sum(-1), z, q.mean
-
-
-def flow_matching_loss(
-    head: nn.Module, action: Tensor, z: Tensor, z_next: Tensor, noise: Tensor, tau: Tensor
-) -> Tensor:
-    """L_FM at each step (...,): the velocity at a_tau = (1 - tau) a_0 + tau a_1 against a_1 - a_0.
-
-    action a_1 and noise a_0 (..., A); z and z_next (..., z_dim); tau (..., 1) in [0, 1].
-    """
-    a_tau = (1 - tau) * noise + tau * action
-    velocity = head(torch.cat([a_tau, tau, z, z_next], -1))
-    return (velocity - (action - noise)).square().sum(-1)
-
-
-def belief_losses(
-    model: nn.ModuleDict, batch: dict[str, Tensor], args: Args, teacher_acts: bool = False
-) -> dict[str, Tensor]:
-    """L_Total = -L_VAE + lambda L_FM, with the KL in L_VAE weighted by beta, and its terms; means over the batch.
-
-    batch: of EpisodeDataset. --fm-latent: z in L_FM is q's mean, or a sample of q (the paper's choice).
-    --action-head mse: the squared error of the predicted action in place of L_FM; none: neither.
-    """
-    h, other_losses = history_losses(model, batch, args, teacher_acts)
-    nll, kl, z_sample, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
-    losses = {"nll": nll.mean(), "kl": kl.mean(), **other_losses}
-    losses["total"] = losses["nll"] + args.beta * losses["kl"] + args.prior_nll * losses["prior_nll"] + losses["memory"]
-    if args.action_head != "none":
-        latent = z_mean if args.fm_latent == "mean" else z_sample
-        action, z, z_next = batch["actions"], latent[:-1], latent[1:]
-        if args.action_head == "flow":
-            noise, tau = torch.randn_like(action), torch.rand_like(action[..., :1])
-            losses["action"] = flow_matching_loss(model["head"], action, z, z_next, noise, tau).mean()
-        else:
-            losses["action"] = (model["head"](torch.cat([z, z_next], -1)) - action).square().sum(-1).mean()
-        losses["total"] = losses["total"] + args.action_lambda * losses["action"]
-    return losses
-
-
 # ---------------------------------------------------------------- data
 
 
@@ -519,9 +523,10 @@ class EpisodeDataset:
 def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output: episodes with u = mean of phi(s), and repr.pt, checked by load."""
     preset = "small" if args.small else "quick" if args.quick else ""
-    path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{preset and '_' + preset}__{args.seed}")
+    suffix, flag = (f"_{preset}", f"--{preset}") if preset else ("", "")
+    path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{suffix}__{args.seed}")
     if not (path / "repr.pt").exists():
-        command = f"python aib_repr.py --env-id {args.env_id} --seed {args.seed} {preset and '--' + preset}"
+        command = f"python aib_repr.py --env-id {args.env_id} --seed {args.seed} {flag}"
         fail(f"{path / 'repr.pt'} does not exist; correct --repr-dir, or run first: {command}")
     stored = load(path / "repr.pt", **expected)
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
@@ -537,7 +542,6 @@ def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]
 @torch.no_grad()
 def validate_belief(belief: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> tuple[Tensor, Tensor]:
     """u and mean particle, of 30 means of p(u|z,h), both (T+1, E, u_dim), of episodes index (E,)."""
-    belief.eval()
     torch.manual_seed(0)  # the same noise every time, so that errors compare
     num_particles = 30
     u, estimate = [], []
@@ -548,7 +552,6 @@ def validate_belief(belief: nn.Module, episodes: EpisodeDataset, index: np.ndarr
         decoded = belief.decode(h, z_noise)
         u.append(batch["u"])
         estimate.append(decoded.mean.mean(-2))
-    belief.train()
     return torch.cat(u, 1), torch.cat(estimate, 1)
 
 
@@ -607,11 +610,15 @@ def main(args: Args) -> None:
     for update in bar:
         rng = np.random.default_rng([args.seed, update])
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
-        progress = (update - args.warmup_updates - 1) / args.num_updates
-        of_phase = progress if progress >= 0 else (update - 1) / args.warmup_updates
-        optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - of_phase))
-        model["teacher"].train(progress < 0)
-        if progress < 0:
+        warming_up = update <= args.warmup_updates
+        if warming_up:
+            progress = (update - 1) / args.warmup_updates
+        else:
+            progress = (update - args.warmup_updates - 1) / args.num_updates
+        # falls to 0 over the second half of each phase, which lowers the error of the last weights
+        optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - progress))
+        model["teacher"].train(warming_up)  # later its statistics stay what they are
+        if warming_up:
             episode = rng.choice(train, 8 * args.batch_episodes)
             # early steps more often (density t^(-1/3)), as they show what is to be remembered
             t = (len(sample["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)

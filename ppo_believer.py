@@ -374,30 +374,6 @@ class HistoryEncoder(nn.Module):
         return self.combine(memory, embedded, joints), torch.cat(after, -1)
 
 
-class Teacher(nn.Module):
-    """What to remember at step t, told by the first privileged state: u_0 (B, u_dim), t (B,) -> memory (B, 16)."""
-
-    def __init__(self, u_dim: int):
-        super().__init__()
-        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)  # as if each std were at least 0.05
-        self.net = orthogonal_init(mlp([u_dim + 1, 64, 16]))
-
-    def forward(self, u_0: Tensor, t: Tensor) -> Tensor:
-        return self.net(torch.cat([self.standardise(u_0), t.log1p().unsqueeze(-1)], -1))
-
-
-class Locator(nn.Module):
-    """What u is if a patch shows the object: contents (..., 10) -> Normal over u (..., u_dim), one std for all."""
-
-    def __init__(self, u_dim: int):
-        super().__init__()
-        self.mean = orthogonal_init(mlp([2 + 8, 64, u_dim]))
-        self.raw_std = nn.Parameter(torch.zeros(u_dim))
-
-    def forward(self, contents: Tensor) -> Normal:
-        return Normal(self.mean(contents), nn.functional.softplus(self.raw_std) + 0.1, validate_args=False)
-
-
 def chrono_init(gru: nn.GRUCell, steps: int) -> None:
     """Let the GRU begin with time constants of 2 to steps: bias log U(1, steps - 1) (Tallec and Ollivier, 2018)."""
     # PyTorch's order is reset, update, new; h' = (1 - update) * new + update * h
@@ -487,6 +463,80 @@ def encode_history(
     return history.combine(taught, places, batch["joints"]), memory
 
 
+def believer_losses(
+    model: nn.ModuleDict, batch: dict[str, Tensor], args: Args, teacher_acts: bool = False
+) -> dict[str, Tensor]:
+    """-ELBO with the fixed prior and its terms, averaged over all steps of a batch of whole episodes."""
+    h, history = history_losses(model, batch, args, teacher_acts)
+    q = model["posterior"](torch.cat([batch["u"], h], -1))
+    decoded = model["belief"].decoder(torch.cat([q.rsample(), h], -1))
+    nll = -decoded.log_prob(batch["u"]).sum(-1).mean()
+    kl = kl_divergence(q, Normal(0.0, 1.0)).sum(-1).mean()
+    total = nll + args.beta * kl + args.prior_nll * history["prior_nll"] + history["memory"]
+    return {"nll": nll, "kl": kl, **history, "total": total}
+
+
+def compute_gae(rewards: Tensor, values: Tensor, gamma: float, gae_lambda: float) -> Tensor:
+    """Generalised advantages (T, N) of whole episodes: rewards (T, N), values (T+1, N) with V(o_T) as the last.
+
+    No done flags: a success ends no episode, and the time limit is a truncation, so V(o_T) is bootstrapped.
+    """
+    advantages, last = torch.empty_like(rewards), torch.zeros_like(rewards[0])
+    deltas = rewards + gamma * values[1:] - values[:-1]
+    for t in reversed(range(len(rewards))):
+        advantages[t] = last = deltas[t] + gamma * gae_lambda * last
+    return advantages
+
+
+def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
+    """PPO's clipped objective (Schulman et al., 2017) on a minibatch (B, ...), with advantages normalised in it."""
+    dist, values = agent(batch)
+    log_ratio = dist.log_prob(batch["actions"]).sum(-1) - batch["logprobs"]
+    ratio = log_ratio.exp()
+    advantages = batch["advantages"]
+    advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+    clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+    policy_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
+    value_loss = 0.5 * (values - batch["returns"]).square().mean()
+    entropy = dist.entropy().sum(-1).mean()
+    return {
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "entropy": entropy,
+        "total": policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss,
+        "approx_kl": (ratio - 1 - log_ratio).mean(),  # Schulman's low-variance estimate
+        "clipfrac": (ratio != clipped).float().mean(),
+    }
+
+
+# ---------------------------------------------------------------- warm-up
+# not in the paper, and off unless --warmup-updates is given, as by --small: how attention learns to find objects
+
+
+class Teacher(nn.Module):
+    """What to remember at step t, told by the first privileged state: u_0 (B, u_dim), t (B,) -> memory (B, 16)."""
+
+    def __init__(self, u_dim: int):
+        super().__init__()
+        self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)  # as if each std were at least 0.05
+        self.net = orthogonal_init(mlp([u_dim + 1, 64, 16]))
+
+    def forward(self, u_0: Tensor, t: Tensor) -> Tensor:
+        return self.net(torch.cat([self.standardise(u_0), t.log1p().unsqueeze(-1)], -1))
+
+
+class Locator(nn.Module):
+    """What u is if a patch shows the object: contents (..., 10) -> Normal over u (..., u_dim), one std for all."""
+
+    def __init__(self, u_dim: int):
+        super().__init__()
+        self.mean = orthogonal_init(mlp([2 + 8, 64, u_dim]))
+        self.raw_std = nn.Parameter(torch.zeros(u_dim))
+
+    def forward(self, contents: Tensor) -> Normal:
+        return Normal(self.mean(contents), nn.functional.softplus(self.raw_std) + 0.1, validate_args=False)
+
+
 def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
 
@@ -568,52 +618,6 @@ def history_losses(
     return h, losses
 
 
-def believer_losses(
-    model: nn.ModuleDict, batch: dict[str, Tensor], args: Args, teacher_acts: bool = False
-) -> dict[str, Tensor]:
-    """-ELBO with the fixed prior and its terms, averaged over all steps of a batch of whole episodes."""
-    h, history = history_losses(model, batch, args, teacher_acts)
-    q = model["posterior"](torch.cat([batch["u"], h], -1))
-    decoded = model["belief"].decoder(torch.cat([q.rsample(), h], -1))
-    nll = -decoded.log_prob(batch["u"]).sum(-1).mean()
-    kl = kl_divergence(q, Normal(0.0, 1.0)).sum(-1).mean()
-    total = nll + args.beta * kl + args.prior_nll * history["prior_nll"] + history["memory"]
-    return {"nll": nll, "kl": kl, **history, "total": total}
-
-
-def compute_gae(rewards: Tensor, values: Tensor, gamma: float, gae_lambda: float) -> Tensor:
-    """Generalised advantages (T, N) of whole episodes: rewards (T, N), values (T+1, N) with V(o_T) as the last.
-
-    No done flags: a success ends no episode, and the time limit is a truncation, so V(o_T) is bootstrapped.
-    """
-    advantages, last = torch.empty_like(rewards), torch.zeros_like(rewards[0])
-    deltas = rewards + gamma * values[1:] - values[:-1]
-    for t in reversed(range(len(rewards))):
-        advantages[t] = last = deltas[t] + gamma * gae_lambda * last
-    return advantages
-
-
-def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
-    """PPO's clipped objective (Schulman et al., 2017) on a minibatch (B, ...), with advantages normalised in it."""
-    dist, values = agent(batch)
-    log_ratio = dist.log_prob(batch["actions"]).sum(-1) - batch["logprobs"]
-    ratio = log_ratio.exp()
-    advantages = batch["advantages"]
-    advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
-    clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
-    policy_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
-    value_loss = 0.5 * (values - batch["returns"]).square().mean()
-    entropy = dist.entropy().sum(-1).mean()
-    return {
-        "policy_loss": policy_loss,
-        "value_loss": value_loss,
-        "entropy": entropy,
-        "total": policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss,
-        "approx_kl": (ratio - 1 - log_ratio).mean(),  # Schulman's low-variance estimate
-        "clipfrac": (ratio != clipped).float().mean(),
-    }
-
-
 # ---------------------------------------------------------------- data
 
 
@@ -643,9 +647,10 @@ class EpisodeDataset:
 def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output: episodes with u = mean of phi(s), and repr.pt, checked by load."""
     preset = "small" if args.small else "quick" if args.quick else ""
-    path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{preset and '_' + preset}__{args.seed}")
+    suffix, flag = (f"_{preset}", f"--{preset}") if preset else ("", "")
+    path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{suffix}__{args.seed}")
     if not (path / "repr.pt").exists():
-        command = f"python aib_repr.py --env-id {args.env_id} --seed {args.seed} {preset and '--' + preset}"
+        command = f"python aib_repr.py --env-id {args.env_id} --seed {args.seed} {flag}"
         fail(f"{path / 'repr.pt'} does not exist; correct --repr-dir, or run first: {command}")
     stored = load(path / "repr.pt", **expected)
     phi = StateEncoder(len(stored["phi"]["mean"]), stored["u_dim"])
@@ -724,7 +729,6 @@ def rollout(
 @torch.no_grad()
 def validate_belief(belief: nn.Module, episodes: EpisodeDataset, index: np.ndarray) -> tuple[Tensor, Tensor]:
     """u and mean particle, of 30 means of p(u|z,h), both (T+1, E, u_dim), of episodes index (E,)."""
-    belief.eval()
     torch.manual_seed(0)  # the same noise every time, so that errors compare
     num_particles = 30
     u, estimate = [], []
@@ -735,7 +739,6 @@ def validate_belief(belief: nn.Module, episodes: EpisodeDataset, index: np.ndarr
         decoded = belief.decode(h, z_noise)
         u.append(batch["u"])
         estimate.append(decoded.mean.mean(-2))
-    belief.train()
     return torch.cat(u, 1), torch.cat(estimate, 1)
 
 
@@ -812,11 +815,15 @@ def train_belief(args: Args, path: Path) -> None:
     for update in bar:
         rng = np.random.default_rng([args.seed, update])
         torch.manual_seed(args.seed * 1_000_000 + update)  # so that a resumed run repeats the update
-        progress = (update - args.warmup_updates - 1) / args.num_updates
-        of_phase = progress if progress >= 0 else (update - 1) / args.warmup_updates
-        optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - of_phase))
-        model["teacher"].train(progress < 0)
-        if progress < 0:
+        warming_up = update <= args.warmup_updates
+        if warming_up:
+            progress = (update - 1) / args.warmup_updates
+        else:
+            progress = (update - args.warmup_updates - 1) / args.num_updates
+        # falls to 0 over the second half of each phase, which lowers the error of the last weights
+        optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - progress))
+        model["teacher"].train(warming_up)  # later its statistics stay what they are
+        if warming_up:
             episode = rng.choice(train, 8 * args.batch_episodes)
             # early steps more often (density t^(-1/3)), as they show what is to be remembered
             t = (len(sample["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
