@@ -52,7 +52,7 @@ class Args:
     device: Literal["cpu", "cuda"] = "cuda" if CUDA else "cpu"
     """where the networks live"""
     small: bool = False
-    """a reduced setting for a CPU: about 2.5 hours for all stages of RememberColor9-v0 on one core"""
+    """a reduced setting for a CPU: by estimate 3 hours for all stages of RememberColor9-v0 on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 

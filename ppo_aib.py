@@ -82,7 +82,7 @@ class Args:
     num_workers: int = 16 if CUDA else min(16, 2 * len(os.sched_getaffinity(0)))
     """simulator processes on physx_cpu, each 0.7 GB of memory; results depend on it by float rounding only"""
     small: bool = False
-    """a reduced setting for a CPU: about 2.5 hours for all stages of RememberColor9-v0 on one core"""
+    """a reduced setting for a CPU: by estimate 3 hours for all stages of RememberColor9-v0 on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 
