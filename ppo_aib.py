@@ -76,7 +76,7 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot_triangles: int = 0 if CUDA else 500
-    """triangles of each robot mesh, about; with 500 a CPU steps 5 to 10 times as fast; 0: meshes as they are"""
+    """triangles of each robot mesh, about; with 500 a CPU steps 5 to 10 times as fast; 0, as physx_cuda needs: all"""
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else min(16, 2 * len(os.sched_getaffinity(0)))
@@ -477,7 +477,10 @@ def rollout(
             actions = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
             # before clamping; PPO ignores that coloured noise is correlated in time
             transition |= {"actions": actions, "logprobs": dist.log_prob(actions).sum(-1)}
-            obs, rewards, _, _, info = envs.step(actions.clamp(-1, 1).cpu().numpy())
+            controls = actions.clamp(-1, 1)
+            if args.sim_backend == "physx_cpu":
+                controls = controls.cpu().numpy()
+            obs, rewards, _, _, info = envs.step(controls)
             transition |= {"rewards": torch.as_tensor(rewards), "success": torch.as_tensor(info["success"])}
             for name, x in transition.items():
                 buffer[name][t, first:last] = x[: last - first]
@@ -716,9 +719,8 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
     The Panda and its camera have half a million triangles; drawing them takes nine tenths of a step on a CPU.
     """
     for link in task.agent.robot.get_links():
-        entities = [body.entity for body in link._objs]  # one per scene
-        meshes = []
-        old = entities[0].find_component_by_type(RenderBodyComponent)
+        entity = link._objs[0].entity
+        old, new = entity.find_component_by_type(RenderBodyComponent), RenderBodyComponent()
         if old is None:
             continue
         for shape in old.render_shapes:
@@ -729,15 +731,11 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
                     mesh.update_faces(mesh.nondegenerate_faces())
                     mesh = mesh.simplify_quadric_decimation(face_count=min(triangles, len(mesh.faces)))
                 uv = np.zeros((len(mesh.vertices), 2))
-                meshes.append((shape.local_pose, mesh.vertices, mesh.faces, mesh.vertex_normals, uv, part.material))
-        for entity in entities:
-            body = RenderBodyComponent()
-            for local_pose, *arrays in meshes:
-                shape = RenderShapeTriangleMesh(*arrays)
-                shape.local_pose = local_pose
-                body.attach(shape)
-            entity.remove_component(entity.find_component_by_type(RenderBodyComponent))
-            entity.add_component(body)
+                drawn = RenderShapeTriangleMesh(mesh.vertices, mesh.faces, mesh.vertex_normals, uv, part.material)
+                drawn.local_pose = shape.local_pose
+                new.attach(drawn)
+        entity.remove_component(old)
+        entity.add_component(new)
 
 
 def make_task(args: Args, num_scenes: int) -> gym.Env:
@@ -756,6 +754,7 @@ def make_task(args: Args, num_scenes: int) -> gym.Env:
         render_backend=args.render_backend,
         reconfiguration_freq=0,  # ShellGame tasks would build the scene, with stock meshes, at every reset
     )
+    # _sensors, _objs and _get_obs_sensor_data are ManiSkill's private names: requirements.txt pins its version
     env.unwrapped._sensors.pop("hand_camera", None)  # the policy does not see through it
     if args.robot_triangles:
         decimate_meshes(env.unwrapped, args.robot_triangles)
@@ -787,6 +786,8 @@ def check_task(args: Args) -> None:
         fail("torch sees no CUDA device here; use --device cpu --sim-backend physx_cpu --render-backend sapien_cpu")
     if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
         fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
+    if args.sim_backend == "physx_cuda" and args.robot_triangles:
+        fail(f"--sim-backend physx_cuda draws meshes as they are; --robot-triangles {args.robot_triangles} must be 0")
     if args.image_size < 36:
         fail(f"--image-size {args.image_size} must be at least 36, for the image network")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -171,24 +170,6 @@ def test_light_meshes_change_a_hundredth_of_the_pixels_and_no_object() -> None:
     names = set(stock.unwrapped.scene.actors)
     assert {"ball", "goal_region", "ground"} <= names
     assert all(shapes(stock, name) == shapes(light, name) for name in names)
-
-
-def test_every_scene_of_a_batch_gets_the_decimated_meshes() -> None:
-    """As on physx_cuda, where a link has one body per scene: here those of two environments."""
-    envs = [aib_repr.make_task(aib_repr.Args(env_id=TASK, robot_triangles=0), 1) for _ in range(2)]
-    links = zip(*(env.unwrapped.agent.robot.get_links() for env in envs), strict=True)
-    batch = [SimpleNamespace(_objs=[link._objs[0] for link in pair]) for pair in links]
-    robot = SimpleNamespace(get_links=lambda: batch)
-    aib_repr.decimate_meshes(SimpleNamespace(agent=SimpleNamespace(robot=robot)), 500)
-    for link in batch:
-        for body in link._objs:
-            drawn = body.entity.find_component_by_type(sapien.render.RenderBodyComponent)
-            for shape in drawn.render_shapes if drawn else ():
-                assert all(len(part.triangles) <= 500 for part in shape.parts)
-    first, second = (env.reset(seed=1)[0]["rgb"].astype(int) for env in envs)
-    assert np.abs(first - second).max() <= 1
-    for env in envs:
-        env.close()
 
 
 def test_random_actions_are_uniform_and_independent() -> None:

@@ -84,14 +84,15 @@ def test_physx_is_downloaded_by_one_process_at_a_time(monkeypatch: pytest.Monkey
     assert started
 
 
-def test_the_gpus_physics_with_the_cpus_pictures(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_what_the_gpus_physics_cannot_draw(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     for module in (aib_repr, ppo_aib, ppo_believer, ppo_baseline):
         monkeypatch.setattr(module, "CUDA", True)
         with pytest.raises(SystemExit) as stop:
             module.check_task(module.Args(sim_backend="physx_cuda", render_backend="sapien_cpu"))
         refused((stop.value.code, *capsys.readouterr()), "physx_cuda needs --render-backend sapien_cuda")
+        with pytest.raises(SystemExit) as stop:
+            module.check_task(module.Args(sim_backend="physx_cuda", render_backend="sapien_cuda", robot_triangles=500))
+        refused((stop.value.code, *capsys.readouterr()), "--robot-triangles 500 must be 0")
 
 
 def test_a_folder_that_cannot_be_written() -> None:
