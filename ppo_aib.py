@@ -225,27 +225,29 @@ class NatureCNN(nn.Module):
             return self.out(self.conv(images.permute(0, 3, 1, 2))).float()
 
 
-class HistoryEncoder(nn.Module):
-    """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
+def attend(queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
+    """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
 
-    1. memory = code(state of the GRU before o_t), of which the first half asks.
-    2. A query made of that half attends to a grid of 16 x 16 patches of o_t, which gives a place: coordinates and
-       values. Keys hold no coordinates, so that layouts of scenes cannot be memorised. Where the attention is not sure,
-       as the arm hides the object, the place stays the one of the step before.
-    3. Constant queries attend to a grid of 32 x 32 finer blocks, which gives eight keypoints, as the place of a moving
-       ball (a spatial softmax, Levine et al., 2016).
-    4. h_t = MLP(memory, place, keypoints) + linear(joints). The GRU then gets place, keypoints and features of o_t.
-    Past actions (E.2) are not in the history: the action head reads a_t off the joints at t and t + 1.
+    Logits of normalised queries and keys lie in [-16, 16], enough to choose one of a thousand: no 1 / sqrt(16).
+    """
+    queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
+    log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
+    return log_weights.exp() @ contents, log_weights
+
+
+class ImageEncoder(nn.Module):
+    """What can be found in an image: 16 x 16 patches with keys to ask for, keypoints, and a summary.
+
+    Keys hold no coordinates, so that layouts of scenes cannot be memorised. Keypoints, as the place of a moving ball,
+    are where constant queries attend to in a grid of 32 x 32 finer blocks (a spatial softmax, Levine et al., 2016).
     """
 
-    def __init__(self, config: dict):
+    def __init__(self, image_shape: list[int]):
         super().__init__()
-        height, width, _ = config["image_shape"]
+        height, width, _ = image_shape
         self.patch, self.block = min(height, width) // 16, min(height, width) // 32  # pixels
-        self.register_buffer("image_mean", torch.zeros(config["image_shape"]))
-        self.register_buffer("image_std", torch.tensor(255.0))
-        self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
-        self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
+        self.register_buffer("mean", torch.zeros(image_shape))
+        self.register_buffer("std", torch.tensor(255.0))
         for name, size in ("patch_coordinates", self.patch), ("block_coordinates", self.block):
             lines = [torch.linspace(-1, 1, length // size) for length in (height, width)]
             self.register_buffer(name, torch.cartesian_prod(*lines))
@@ -253,25 +255,15 @@ class HistoryEncoder(nn.Module):
         self.token_heads = nn.Linear(64, 16 + 8 + 32)
         self.point = orthogonal_init(mlp([3 * self.block**2, 32, 16]))
         self.point_queries = nn.Parameter(torch.randn(8, 16))
-        self.code = nn.Linear(256, 16 + 16)
-        self.query = orthogonal_init(mlp([16, 64, 16]))
-        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; begins to trust it at 0.4
-        nn.init.constant_(self.sure.weight, 10.0)
-        nn.init.constant_(self.sure.bias, -4.0)
-        self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
-        self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
-        self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
-        self.gru = nn.GRUCell(64 + 32, 256)
 
-    def look(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
+    def forward(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
 
         Contents are coordinates and values; the summary is (B, 32). mask: share of the blocks of 2 x 2 pixels that are
         replaced by the mean for all but the keypoints.
         """
-        images = rgb.float().sub_(self.image_mean).div_(self.image_std)
-        point_keys = self.point(self.cut(images, self.block))
-        keypoints, _ = self.attend(self.point_queries, point_keys, self.block_coordinates)
+        images = rgb.float().sub_(self.mean).div_(self.std)
+        keypoints, _ = attend(self.point_queries, self.point(self.cut(images, self.block)), self.block_coordinates)
         if mask:
             batch, height, width = rgb.shape[0], rgb.shape[1] // 2, rgb.shape[2] // 2  # in blocks
             kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
@@ -286,18 +278,35 @@ class HistoryEncoder(nn.Module):
         """Images (B, H, W, 3) -> N patches (B, N, 3 size^2); a linear layer on them is a convolution of that stride."""
         return images.unfold(1, size, size).unfold(2, size, size).flatten(1, 2).flatten(2)
 
-    def attend(self, queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
 
-        Logits of normalised queries and keys lie in [-16, 16], enough to choose one of a thousand: no 1 / sqrt(16).
-        """
-        queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
-        log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
-        return log_weights.exp() @ contents, log_weights
+class HistoryEncoder(nn.Module):
+    """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
+
+    1. memory = code(state of the GRU before o_t), of which the first half asks.
+    2. A query made of that half attends to the patches of o_t, which gives a place: coordinates and values. Where the
+       attention is not sure, as the arm hides the object, the place stays the one of the step before.
+    3. h_t = MLP(memory, place, keypoints) + linear(joints). The GRU then gets place, keypoints and summary of o_t.
+    Past actions (E.2) are not in the history: the action head reads a_t off the joints at t and t + 1.
+    """
+
+    def __init__(self, config: dict):
+        super().__init__()
+        self.image = ImageEncoder(config["image_shape"])
+        self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
+        self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
+        self.code = nn.Linear(256, 16 + 16)
+        self.query = orthogonal_init(mlp([16, 64, 16]))
+        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; begins to trust it at 0.4
+        nn.init.constant_(self.sure.weight, 10.0)
+        nn.init.constant_(self.sure.bias, -4.0)
+        self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
+        self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
+        self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
+        self.gru = nn.GRUCell(64 + 32, 256)
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
         """Memory (..., 32), of which the first 16 ask -> place (..., 10), log weights of the patches (..., N)."""
-        place, log_weights = self.attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
+        place, log_weights = attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
         return place.squeeze(-2), log_weights.squeeze(-2)
 
     def keep(self, place: Tensor, log_weights: Tensor, before: Tensor) -> Tensor:
@@ -308,7 +317,7 @@ class HistoryEncoder(nn.Module):
     def step(
         self, hidden: Tensor, place: Tensor, keys: Tensor, contents: Tensor, keypoints: Tensor, summary: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """One step of the recurrence: the GRU's state (B, 256) and the place (B, 10) before, and what look found.
+        """One step of the recurrence: the GRU's state (B, 256) and the place (B, 10) before; what ImageEncoder found.
 
         Returns memory (B, 32), embedded places (B, 64), and the GRU's state and the place after.
         """
@@ -329,7 +338,7 @@ class HistoryEncoder(nn.Module):
         """
         if recurrent is None:
             recurrent = joints.new_zeros(len(rgb), 256 + 10)
-        memory, embedded, *after = self.step(*recurrent.split([256, 10], -1), *self.look(rgb))
+        memory, embedded, *after = self.step(*recurrent.split([256, 10], -1), *self.image(rgb))
         return self.combine(memory, embedded, joints), torch.cat(after, -1)
 
 

@@ -266,8 +266,8 @@ def test_gradients_reach_the_first_frame_and_come_in_chunks_as_well(monkeypatch:
     assert all(torch.allclose(one, other, rtol=1e-4, atol=1e-6) for one, other in zip(*gradients, strict=True))
     history, batch = belief_model()["belief"].history, belief_batch(59)
     images = batch["rgb"].float().requires_grad_()
-    look = history.look
-    monkeypatch.setattr(history, "look", lambda rgb, mask: look(rgb + 0, mask))  # look subtracts in place
+    look = history.image.forward
+    monkeypatch.setattr(history.image, "forward", lambda rgb, mask: look(rgb + 0, mask))  # it subtracts in place
     aib_belief.encode_history(history, {**batch, "rgb": images})[0][-1].sum().backward()
     assert images.grad[0].abs().sum() > 0
 
@@ -275,7 +275,7 @@ def test_gradients_reach_the_first_frame_and_come_in_chunks_as_well(monkeypatch:
 def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
     history, rgb = belief_model()["belief"].history, torch.zeros(2, *IMAGE, dtype=torch.uint8)
     rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255  # a patch is 2 x 2 pixels here
-    keys, contents, keypoints, summary = history.look(rgb)
+    keys, contents, keypoints, summary = history.image(rgb)
     assert keys.shape == (2, 18**2, 16) and contents.shape == (2, 18**2, 10)
     assert keypoints.shape == (2, 8 * 2) and summary.shape == (2, 32)
     patches = [2 * 18 + 5, 15 * 18 + 10]
@@ -293,18 +293,20 @@ def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
     assert torch.allclose(contents[[0, 1], patches, :2], torch.tensor(row_and_column))
 
 
-def test_keypoints_move_with_what_they_show() -> None:
+def test_keypoints_move_with_what_they_show(monkeypatch: pytest.MonkeyPatch) -> None:
     history, rgb = belief_model()["belief"].history, torch.zeros(2, *IMAGE, dtype=torch.uint8)
     rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255
     with torch.no_grad():
-        images = (rgb.float() - history.image_mean) / history.image_std
-        red = history.point(images[0, 4, 10])
-        history.point_queries[0] = red - history.point(images[0, 0, 0])  # asks for red and not for black
-    history.attend = lambda queries, keys, contents: (
-        (50 * nn.functional.layer_norm(queries, [16]) @ nn.functional.layer_norm(keys, [16]).mT).softmax(-1) @ contents,
-        None,
-    )
-    places = history.look(rgb, mask=0.9)[2].unflatten(1, (8, 2))[:, 0]  # keypoints see what is masked, too
+        images = (rgb.float() - history.image.mean) / history.image.std
+        red = history.image.point(images[0, 4, 10])
+        history.image.point_queries[0] = red - history.image.point(images[0, 0, 0])  # asks for red and not for black
+
+    def attend(queries: torch.Tensor, keys: torch.Tensor, contents: torch.Tensor) -> tuple[torch.Tensor, None]:
+        queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
+        return (50 * queries @ keys.mT).softmax(-1) @ contents, None
+
+    monkeypatch.setattr(aib_belief, "attend", attend)  # sharper
+    places = history.image(rgb, mask=0.9)[2].unflatten(1, (8, 2))[:, 0]  # keypoints see what is masked, too
     middle = torch.tensor([[4.5, 10.5], [30.5, 20.5]]) / 35 * 2 - 1
     assert torch.allclose(places, middle, atol=0.02)
 
@@ -319,10 +321,10 @@ def test_a_place_is_kept_while_the_attention_is_not_sure() -> None:
 def test_masks_hide_blocks_of_two_by_two_pixels() -> None:
     history = aib_belief.HistoryEncoder({**CONFIG, "image_shape": [37, 45, 3]})
     rgb = torch.randint(0, 256, (40, 37, 45, 3), dtype=torch.uint8)
-    history.image_mean = torch.full((37, 45, 3), 3.5)
+    history.image.mean = torch.full((37, 45, 3), 3.5)
     seen = []
-    history.token.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].unflatten(2, (3, 4))))
-    plain, again, masked = history.look(rgb), history.look(rgb), history.look(rgb, 0.75)
+    history.image.token.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].unflatten(2, (3, 4))))
+    plain, again, masked = history.image(rgb), history.image(rgb), history.image(rgb, 0.75)
     assert torch.equal(plain[0], again[0]) and not torch.equal(plain[0], masked[0])
     hidden = (seen[2] == 0).flatten(2).all(-1)
     assert 0.72 < hidden.float().mean() < 0.78 and torch.equal(seen[2][~hidden], seen[0][~hidden])
@@ -340,7 +342,7 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     u_0 = batch["u_0"]
     standard = (u_0 - u_0.mean(0)) / (u_0.var(0, correction=0) + 0.05**2).sqrt()
     memory = model["teacher"].net(torch.cat([standard, (batch["t"] + 1).log()[:, None]], -1))
-    keys, contents, keypoints, _ = history.look(batch["rgb"])
+    keys, contents, keypoints, _ = history.image(batch["rgb"])
     place, log_weights = history.ask(memory, keys, contents)
     weights, errors = log_weights.exp(), []
     memory = torch.cat([memory, torch.zeros(B, 16)], -1)
@@ -416,8 +418,8 @@ def test_chrono_initialisation_sets_the_update_gate() -> None:
 def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_stages: Path) -> None:
     rgb = np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "rgb.npy")[:16, ::8].astype(float)
     history = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)["belief"]
-    assert torch.allclose(history["history.image_mean"].double(), torch.from_numpy(rgb.mean((0, 1))), atol=1e-3)
-    assert abs(history["history.image_std"].item() - (rgb - rgb.mean((0, 1))).std()) < 1e-3
+    assert torch.allclose(history["history.image.mean"].double(), torch.from_numpy(rgb.mean((0, 1))), atol=1e-3)
+    assert abs(history["history.image.std"].item() - (rgb - rgb.mean((0, 1))).std()) < 1e-3
     joints = torch.from_numpy(np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "joints.npy")[:16]).flatten(0, 1)
     assert torch.allclose(history["history.joints_mean"], joints.mean(0), atol=1e-4)
     assert torch.allclose(history["history.joints_std"], joints.std(0, correction=0), atol=1e-4)
@@ -449,12 +451,13 @@ def test_psi_without_images_sees_the_joints_alone(toy_stages: Path) -> None:
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:
     psi, history = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4), aib_belief.HistoryEncoder(CONFIG)
     rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.randn(2, 7)
-    for encoder, encode, layer in (
-        (psi, lambda x: psi(x, joints).mean, psi.cnn.out[0]),
-        (history, lambda x: history(x, joints)[0], history.token[0][0]),
+    for encoder, names, encode, layer in (
+        (psi, ["image_mean", "image_std"], lambda x: psi(x, joints).mean, psi.cnn.out[0]),
+        (history.image, ["mean", "std"], lambda x: history(x, joints)[0], history.image.token[0][0]),
     ):
         plain = encode(rgb)
-        encoder.image_mean, encoder.image_std = torch.full(IMAGE, 50.0), torch.tensor(510.0)
+        setattr(encoder, names[0], torch.full(IMAGE, 50.0))
+        setattr(encoder, names[1], torch.tensor(510.0))
         assert not torch.allclose(encode(rgb), plain, atol=1e-4)
         assert torch.allclose(encode(2 * rgb + 50), plain, atol=1e-5)
         weight = layer.weight
