@@ -321,20 +321,18 @@ def save_figure(figure: plt.Figure, axes: np.ndarray, path: Path) -> None:
 
 
 def learning_curves(panels: list[tuple], path: Path, columns: int) -> None:
-    """success_once and chance, one panel for each of: task, title, curves with their labels and colours."""
+    """A metric and chance, one panel for each of: task, title, metric, curves with their labels and colours."""
     rows = math.ceil(len(panels) / columns)
     size = (4 * columns, 3 * rows)
     figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", sharey=True, squeeze=False)
-    for ax, (task, title, curves) in zip(axes.flat, panels, strict=False):
+    for ax, (task, title, metric, curves) in zip(axes.flat, panels, strict=False):
         for curve, label, colour in curves:
             draw(ax, curve, label, colour)
         if task in CHANCE:
             ax.axhline(CHANCE[task], color="grey", linestyle=":", label="chance")
         ax.set_title(title, fontsize=9)
-        ax.set(xlabel="PPO steps", ylim=(-0.03, 1.03))  # curves at 0 beside the axis
+        ax.set(xlabel="PPO steps", ylabel=metric, ylim=(-0.03, 1.03))  # curves at 0 beside the axis
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 100k
-    for ax in axes[:, 0]:
-        ax.set_ylabel("success_once")
     save_figure(figure, axes, path)
 
 
@@ -381,9 +379,14 @@ def rebuild(output: Path) -> None:
             found = by_seed(evals, "success_once", task=task, method=method, setting=setting)
             curves.append((found, method, COLOURS[method]))
         seeds = ", ".join(f"{found.shape[1]} {method}" for found, method, _ in curves)
-        panels.append((task, f"{task.removesuffix('-v0')}\nseeds: {seeds}", curves))
+        panels.append((task, f"{task.removesuffix('-v0')}\nseeds: {seeds}", "success_once", curves))
     learning_curves(panels, output / "benchmark" / "results" / "learning_curves.png", columns=3)
     belief_figure(beliefs, output / "benchmark" / "results" / "beliefs.png")
+
+
+def plus_minus(values: pd.Series) -> str:
+    """Mean ± sample standard deviation over seeds, of which one has none."""
+    return f"{values.mean():.2f}" + (f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else "")
 
 
 def own_runs(evals: pd.DataFrame, task: str) -> str:
@@ -396,9 +399,21 @@ def own_runs(evals: pd.DataFrame, task: str) -> str:
         steps = found.groupby("seed").step.max().min()
         for metric in METRICS[:2]:
             curves = by_seed(found, metric)
-            rows.append((metric, f"{setting}, {steps:,} steps", summarise(last(curves, 3)), summarise(curves.max())))
+            rows.append((metric, f"{setting}, {steps:,} steps", plus_minus(last(curves, 3)), plus_minus(curves.max())))
     head = (task, "run", "mean of the last three", "maximum")
     return markdown([dict(zip(head, row, strict=True)) for row in sorted(rows)])
+
+
+def average(evals: pd.DataFrame) -> str:
+    """Each setting's (exp_name's) mean over its tasks, as the paper's AVG row: of each seed that has them all."""
+    rows = []
+    for setting, found in evals.groupby("setting"):
+        row = {"average": setting, "tasks": ", ".join(task.removesuffix("-v0") for task in sorted({*found.task}))}
+        for metric in METRICS[:2]:
+            by_task = [last(by_seed(runs, metric), 3) for _, runs in found.groupby("task")]
+            row[metric] = plus_minus(pd.concat(by_task, axis=1).dropna().mean(axis=1))
+        rows.append(row)
+    return markdown(rows)
 
 
 def report_runs(args: Args) -> None:
@@ -409,18 +424,23 @@ def report_runs(args: Args) -> None:
     args.output.mkdir(parents=True, exist_ok=True)
     panels, parts = [], ["# Report"]
     colours = {setting: f"C{i % 10}" for i, setting in enumerate(sorted(evals.setting.unique()))}
-    for task, found in evals.groupby("task"):
-        curves = []
-        for setting, runs in found.groupby("setting"):
-            curves.append((by_seed(runs, "success_once"), setting, colours[setting]))
-        panels.append((task, task, curves))
-        parts.append(own_runs(evals, task))
-    learning_curves(panels, args.output / "learning_curves.png", columns=len(panels))
-    parts.append("![success_once](learning_curves.png)")
+    tasks = sorted({*evals.task})
+    for metric in METRICS[:2]:
+        for task in tasks:
+            curves = [
+                (by_seed(runs, metric), setting, colours[setting])
+                for setting, runs in select(evals, task=task).groupby("setting")
+            ]
+            panels.append((task, task, metric, curves))
+    learning_curves(panels, args.output / "learning_curves.png", columns=len(tasks))
+    parts += [own_runs(evals, task) for task in tasks]
+    if len(tasks) > 1:
+        parts.append(average(evals))
+    parts.append("![success_once and success_at_end](learning_curves.png)")
     if not beliefs.empty:
         parts.append(beliefs_table(beliefs, sorted({*zip(beliefs.task, beliefs.setting, strict=True)})))
     (args.output / "report.md").write_text("\n\n".join(parts) + "\n")
-    print(f"{args.output / 'report.md'}: {', '.join(task for task, *_ in panels)}")
+    print(f"{args.output / 'report.md'}: {', '.join(tasks)}")
 
 
 def main(args: Args) -> None:

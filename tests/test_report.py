@@ -21,11 +21,13 @@ import report
 TASK = "RememberShapeAndColor3x2-v0"
 
 
-def record(runs: Path, exp_name: str, seed: int, success_once: list[float], quick: bool = False) -> None:
+def record(
+    runs: Path, exp_name: str, seed: int, success_once: list[float], quick: bool = False, task: str = TASK
+) -> None:
     """A run directory with as many evaluations; success_at_end is half of success_once."""
-    path = runs / f"{TASK}__{exp_name}__{seed}"
+    path = runs / f"{task}__{exp_name}__{seed}"
     path.mkdir(parents=True)
-    (path / "args.json").write_text(json.dumps({"env_id": TASK, "exp_name": exp_name, "seed": seed, "quick": quick}))
+    (path / "args.json").write_text(json.dumps({"env_id": task, "exp_name": exp_name, "seed": seed, "quick": quick}))
     lines = ["iteration,global_step,success_once,success_at_end,return"]
     lines += [f"{i},{1000 * i},{value},{value / 2},3.5" for i, value in enumerate(success_once, 1)]
     (path / "eval.csv").write_text("\n".join(lines) + "\n")
@@ -47,14 +49,18 @@ def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     report.main(report.Args(runs=tmp_path, output=tmp_path / "report"))
     text = (tmp_path / "report" / "report.md").read_text()
     # last three: 0.6, 0.5, 0.8: mean 0.6333; maxima 0.9, 0.6, 0.9
-    aib = "0.63 (0.60, 0.50, 0.80) | 0.80 (0.90, 0.60, 0.90)"
+    aib = "0.63 ± 0.15 | 0.80 ± 0.17"
     assert f"| success_once | ppo_aib, 4,000 steps | {aib} |" in text
-    assert "| success_at_end | ppo_aib, 4,000 steps | 0.32 (0.30, 0.25, 0.40) |" in text
+    assert "| success_at_end | ppo_aib, 4,000 steps | 0.32 ± 0.08 |" in text
     assert "| success_once | ppo_baseline, 3,000 steps | 0.13 | 0.30 |" in text
     assert "| success_once | published_ppo, 1,000 steps | 0.25 | 0.25 |" in text
     assert "| success_once | AIB, the paper's | 0.82 ± 0.04 | 0.87 ± 0.01 |" in text
     assert "| AIB, no head | aib_belief | 1 |  |  | 0.90 | 0.50 | 0.25 | 0.50 | -3.00 | -4.00 |  |" in text
-    assert "quick" not in text
+    assert "quick" not in text and "average" not in text
+    record(tmp_path, "ppo_aib", 1, [0.4], task="InterceptFast-v0")
+    report.main(report.Args(runs=tmp_path, output=tmp_path / "report"))
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "| ppo_aib | InterceptFast, RememberShapeAndColor3x2 | 0.50 | 0.25 |" in text, "seed 1 alone has both"
     assert iio.imread(tmp_path / "report" / "learning_curves.png").std() > 10
 
 
