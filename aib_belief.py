@@ -576,11 +576,11 @@ def main(args: Args) -> None:
     """Train the belief on whole episodes, report what it remembers of held-out ones."""
     if args.device == "cuda" and not CUDA:
         fail("torch sees no CUDA device here; use --device cpu")
-    episodes, stored = load_episodes(args, env_id=args.env_id)
     path = open_run(args)
     if (path / "belief.pt").exists():
         print(f"{path / 'belief.pt'} is finished")
         return
+    episodes, stored = load_episodes(args, env_id=args.env_id)
     num_val = stored["num_val"]
     train, held_out = np.split(np.arange(len(episodes)), [-num_val])
     sample = episodes(train[:1])

@@ -7,7 +7,8 @@ each episode shows the particles of another one, so that an agent loses what it 
 
 Usage:   python benchmark/diagnose_agent.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
 Reads:   phi from stage 1's run of the agent's task, preset and seed, or from --repr-dir
-Prints:  the evaluation with nearest_is_right and u_r2 in place of return; writes nothing
+Writes:  diagnosis.json, or with --swap-particles diagnosis_swapped.json, beside the agent: the evaluation with
+         nearest_is_right and u_r2 in place of return
 """
 
 import sys
@@ -110,7 +111,8 @@ def main(args: Args) -> None:
         make_envs = script.make_envs
         script.make_envs = lambda arguments: RecordState(make_envs(arguments))
     script.success_and_return = lambda buffer: diagnose(buffer, None if script is ppo_baseline else phi)
-    script.save = lambda path, content: None
+    save, name = script.save, "diagnosis_swapped.json" if args.swap_particles else "diagnosis.json"
+    script.save = lambda path, content: save(path.with_name(name), content) if path.suffix == ".json" else None
     settings = script.Args(checkpoint=str(args.checkpoint), sim_backend="physx_cpu", num_workers=args.num_workers)
     settings.num_eval_episodes = args.num_eval_episodes
     script.evaluate_checkpoint(settings)

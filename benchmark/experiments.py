@@ -1,26 +1,29 @@
-"""The paper's experiments as plain commands: 4 tasks x 3 methods x 3 seeds, and the ablations on InterceptFast-v0.
+"""The paper's experiments as shell commands: 4 tasks x 3 methods x 3 seeds, and the ablations on InterceptFast-v0.
 
-Three phases, each built on the one before: stage 1, the beliefs, PPO. A command that was stopped goes on, and one that
-is finished does nothing.
+They come in blocks of one task and one seed: episodes, phi, a belief of AIB, PPO of three methods, tests of the agents.
+All blocks of one seed come before those of the next, so that what has been run is a complete table of fewer seeds. A
+command that was stopped goes on, and one that is finished does nothing.
 
 Usage:   python benchmark/experiments.py             (print the commands)
          python benchmark/experiments.py | bash -e   (run them here, one after another)
-         bash benchmark/slurm.sh                     (submit them to SLURM)
+         bash benchmark/slurm.sh                     (submit those of stages 1 to 3 to SLURM)
 """
 
-import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import tyro
 
 PAPER_TASKS = ("RememberShapeAndColor3x2-v0", "RememberColor9-v0", "InterceptMedium-v0", "InterceptFast-v0")
-ABLATIONS = {  # variants of aib_belief.py on InterceptFast-v0: Figures 3 and 4
-    "mse": ["--action-head", "mse"],
-    "none": ["--action-head", "none"],
-    "lambda_0.1": ["--action-lambda", "0.1"],
-    "lambda_0.01": ["--action-lambda", "0.01"],
+ABLATED = "InterceptFast-v0"
+ABLATIONS = {  # variants of aib_belief.py on that task: Figures 3 and 4
+    "none": "--action-head none",
+    "mse": "--action-head mse",
+    "lambda_0.1": "--action-lambda 0.1",
+    "lambda_0.01": "--action-lambda 0.01",
 }
+METHODS = ("ppo_aib", "ppo_believer", "ppo_baseline")
 
 
 @dataclass
@@ -30,36 +33,82 @@ class Args:
     seeds: tuple[int, ...] = (1, 2, 3)
     """seeds of every experiment"""
     ablations: bool = True
-    """also the action heads and loss weights on InterceptFast-v0"""
+    """also the action heads and loss weights on InterceptFast-v0, where it is among the tasks"""
     small: bool = False
-    """with the scripts' --small, on any tasks, without ablations"""
+    """with the scripts' --small, and plain PPO also with as many steps as AIB has with its random episodes"""
     phase: Literal[1, 2, 3] | None = None
-    """only this phase"""
+    """only the commands of this stage"""
 
 
-def commands(args: Args) -> dict[int, list[list[str]]]:
-    """The commands of each phase, as lists of words after `python`."""
-    phases = {1: [], 2: [], 3: []}
-    size = ["--small"] if args.small else []
-    for task in args.tasks:
+def block(args: Args, task: str, seed: int) -> Iterator[tuple[int, str]]:
+    """Stage (4: tests) and command of everything of one task and seed but the ablations."""
+    preset, suffix = (" --small", "_small") if args.small else ("", "")
+    run = f"--env-id {task} --seed {seed}{preset}"
+    yield 1, f"aib_repr.py {run}"
+    yield 2, f"aib_belief.py {run}"
+    for method in METHODS:
+        yield 3, f"{method}.py {run}"
+        yield from tests(f"runs/{task}__{method}{suffix}__{seed}", f"{method}.py {run}")
+    for script in ("aib_belief", "ppo_believer"):
+        yield from probes(f"runs/{task}__{script}{suffix}__{seed}")
+    if not (args.ablations and task == ABLATED):
+        yield 4, f"rm -f runs/{task}__aib_repr{suffix}__{seed}/dataset/rgb.npy"  # gigabytes that no later command reads
+    if args.small:
+        own, equal = (f"runs/{task}__{name}__{seed}" for name in ("ppo_baseline_small", "ppo_baseline_equal"))
+        more = 4000 * (90 if task.startswith("Intercept") else 60)  # steps of the random episodes
+        longer = f"ppo_baseline.py {run} --exp-name ppo_baseline_equal --total-timesteps {240_000 + more}"
+        kept = " ".join(f"{own}/{name}" for name in ("agent.pt", "eval.csv", "checkpoint.pt"))
+        yield 4, f"[ -e {equal}/checkpoint.pt ] || {{ mkdir -p {equal} && cp {kept} {equal}/; }}"
+        yield 3, longer
+        yield from tests(equal, longer)
+
+
+def ablations(args: Args, seed: int) -> Iterator[tuple[int, str]]:
+    """Stage and command of AIB with other action heads and loss weights, on the episodes and phi of the block."""
+    task, preset, suffix = (ABLATED, " --small", "_small") if args.small else (ABLATED, "", "")
+    for name, change in ABLATIONS.items():
+        run = f"--env-id {task} --seed {seed}{preset}"
+        belief = f"runs/{task}__aib_belief{suffix}_{name}__{seed}"
+        agent = f"ppo_aib.py {run} --exp-name ppo_aib{suffix}_{name} --belief {belief}/belief.pt"
+        yield 2, f"aib_belief.py {run} --exp-name aib_belief{suffix}_{name} {change}"
+        yield from probes(belief)
+        yield 3, agent
+        yield from tests(f"runs/{task}__ppo_aib{suffix}_{name}__{seed}", agent)
+
+
+def tests(folder: str, command: str) -> Iterator[tuple[int, str]]:
+    """The last agent on 256 test episodes, and what it makes of its belief."""
+    yield 4, f"[ -e {folder}/evaluation.json ] || .venv/bin/python {command} --evaluate --num-eval-episodes 256"
+    yield 4, diagnosis(folder, "diagnosis.json", "")
+    if "ppo_baseline" not in command:
+        yield 4, diagnosis(folder, "diagnosis_swapped.json", " --swap-particles")
+
+
+def diagnosis(folder: str, file: str, flag: str) -> str:
+    """The command that writes the file."""
+    script = ".venv/bin/python benchmark/diagnose_agent.py"
+    return f"[ -e {folder}/{file} ] || {script} --checkpoint {folder}/agent.pt{flag}"
+
+
+def probes(folder: str) -> Iterator[tuple[int, str]]:
+    """What the belief of a run knows of held-out episodes."""
+    yield 4, f"[ -e {folder}/diagnostics.json ] || .venv/bin/python benchmark/belief.py --run {folder}"
+
+
+def commands(args: Args) -> list[tuple[int, str]]:
+    """Stage and command of everything, in order."""
+    found = []
+    for seed in args.seeds:
+        for task in args.tasks:
+            found += block(args, task, seed)
+    if args.ablations and ABLATED in args.tasks:
         for seed in args.seeds:
-            run = ["--env-id", task, "--seed", str(seed), *size]
-            phases[1].append(["aib_repr.py", *run])
-            phases[2].append(["aib_belief.py", *run])
-            phases[3] += [[f"{script}.py", *run] for script in ("ppo_aib", "ppo_believer", "ppo_baseline")]
-    if args.ablations and not size and "InterceptFast-v0" in args.tasks:
-        for name, change in ABLATIONS.items():
-            for seed in args.seeds:
-                run = ["--env-id", "InterceptFast-v0", "--seed", str(seed)]
-                belief = f"runs/InterceptFast-v0__aib_belief_{name}__{seed}/belief.pt"
-                phases[2].append(["aib_belief.py", *run, "--exp-name", f"aib_belief_{name}", *change])
-                phases[3].append(["ppo_aib.py", *run, "--exp-name", f"ppo_aib_{name}", "--belief", belief])
-    return phases
+            found += ablations(args, seed)
+    return [(phase, line if line.startswith(("[", "rm")) else f".venv/bin/python {line}") for phase, line in found]
 
 
 if __name__ == "__main__":
     args = tyro.cli(Args)
-    for phase, todo in commands(args).items():
+    for phase, line in commands(args):
         if args.phase in (None, phase):
-            for words in todo:
-                print(shlex.join([".venv/bin/python", *words]))
+            print(line)

@@ -117,7 +117,7 @@ def test_an_agent_plays_in_a_loop_of_ones_own(quick_runs: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_an_agent_is_diagnosed_and_nothing_is_written(
+def test_an_agent_is_diagnosed_and_nothing_else_is_written(
     quick_runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.chdir(quick_runs.parent)
@@ -129,9 +129,13 @@ def test_an_agent_is_diagnosed_and_nothing_is_written(
         code, out, err = run("benchmark/diagnose_agent", *arguments, cwd=quick_runs.parent)
         assert code == 0, err
         found.append(json.loads(out[out.index("{") :]))
+        file = quick_runs.parent / agent.with_name("diagnosis_swapped.json" if options else "diagnosis.json")
+        assert json.loads(file.read_text()) == found[-1]
+        file.unlink()
         assert 0 <= found[-1]["nearest_is_right"] <= 1
     assert found[0]["u_r2"] != found[1]["u_r2"], "other particles, other actions, other states"
-    assert before == {file: file.stat().st_mtime_ns for file in quick_runs.rglob("*")}
+    after = {file: file.stat().st_mtime_ns for file in quick_runs.rglob("*")}
+    assert {**after, agent.parent: 0} == {**before, agent.parent: 0}, "nothing else is written"
 
     def refused(words: str, args: diagnose_agent.Args) -> None:
         with pytest.raises(SystemExit):

@@ -15,7 +15,8 @@ import tyro
 from conftest import ROOT, SCRIPTS
 
 sys.path.append(str(ROOT / "benchmark"))
-import experiments
+import belief
+import diagnose_agent
 import report
 
 TASK = "RememberShapeAndColor3x2-v0"
@@ -168,18 +169,26 @@ def test_nothing_to_report(tmp_path: Path, capsys: pytest.CaptureFixture) -> Non
 
 
 def test_every_command_of_the_matrix_is_one_the_scripts_accept() -> None:
-    printed = subprocess.run(
-        [sys.executable, str(ROOT / "benchmark" / "experiments.py")], capture_output=True, text=True
-    )
-    lines = printed.stdout.splitlines()
-    assert printed.returncode == 0 and len(lines) == 12 + (12 + 12) + (36 + 12) == len(set(lines))
-    modules = {f"{name}.py": __import__(name) for name in SCRIPTS}
-    made = set()
-    for line in lines:
-        python, script, *words = shlex.split(line)
-        args = tyro.cli(modules[script].Args, args=words)
-        name = f"runs/{args.env_id}__{args.exp_name}__{args.seed}"
-        if script == "ppo_aib.py":
-            assert (args.belief or f"runs/{args.env_id}__aib_belief__{args.seed}/belief.pt") in made
-        made |= {name + "/belief.pt"} if script == "aib_belief.py" else {name}
-    assert len(experiments.commands(experiments.Args(ablations=False))[3]) == 36
+    scripts = {f"{name}.py": __import__(name).Args for name in SCRIPTS}
+    scripts |= {"benchmark/belief.py": belief.Args, "benchmark/diagnose_agent.py": diagnose_agent.Args}
+    for flags in ([], ["--small", "--seeds", "11"]):
+        experiment = [sys.executable, str(ROOT / "benchmark" / "experiments.py"), *flags]
+        printed = subprocess.run(experiment, capture_output=True, text=True)
+        assert printed.returncode == 0
+        lines = [line.partition("|| ")[2] or line for line in printed.stdout.splitlines()]
+        made = set()
+        for line in lines:
+            if line.startswith(("rm", "{ mkdir")):
+                continue
+            python, script, *words = shlex.split(line)
+            args = tyro.cli(scripts[script], args=words)
+            if script.startswith("benchmark"):
+                assert str(args.run if script == "benchmark/belief.py" else args.checkpoint.parent) in made
+                continue
+            size = "_small" if args.small else ""
+            if script == "ppo_aib.py":
+                default = f"runs/{args.env_id}__aib_belief{size}__{args.seed}/belief.pt"
+                assert str(Path(args.belief or default).parent) in made
+            name = args.exp_name if args.exp_name != scripts[script].exp_name else script.removesuffix(".py") + size
+            made.add(f"runs/{args.env_id}__{name}__{args.seed}")
+        assert len(made) == (3 * (4 * 5 + 4 * 2) if not flags else 4 * 6 + 4 * 2)
