@@ -128,6 +128,8 @@ MAY_DIFFER = ("num_workers", "total_timesteps", "checkpoint")  # when a run is r
 TASKS = {  # other tasks use the defaults, which are Table 5's for Intercept
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
+    "RememberColor5-v0": dict(gamma=0.95),  # not in Table 5: as RememberColor9
+    "RememberColor3-v0": dict(gamma=0.95),
 }
 SMALL = dict(
     exp_name="ppo_baseline_small",
@@ -136,7 +138,6 @@ SMALL = dict(
     num_minibatches=8,
     update_epochs=8,
     cnn_lr_scale=0.1,
-    gamma=0.95,
     target_kl=0.1,
     init_std=0.3,
     noise_beta=0.7,
