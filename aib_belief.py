@@ -650,10 +650,11 @@ def main(args: Args) -> None:
                 writer.add_scalar(f"belief/{name}", value, update)
 
         if update % VAL_EVERY == 0 or update == num_updates:
-            u, estimate = validate_belief(model["belief"], episodes, held_out)
-            error = (u - estimate).square().sum(-1).mean().item()
-            writer.add_scalar("belief/held_out_error", error, update)
-            bar.set_postfix(held_out_error=f"{error:.3f}")
+            if not warming_up:  # before there is no memory to validate
+                u, estimate = validate_belief(model["belief"], episodes, held_out)
+                error = (u - estimate).square().sum(-1).mean().item()
+                writer.add_scalar("belief/held_out_error", error, update)
+                bar.set_postfix(held_out_error=f"{error:.3f}")
             writer.flush()
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "checkpoint.pt", checkpoint)

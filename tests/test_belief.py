@@ -110,7 +110,8 @@ def test_believers_belief_gets_the_episodes_phi_and_statistics_of_aibs(
     assert [index for index in read if 16 in index] == [[16, 17, 18, 19]] * 2
     belief = torch.load(path / "belief.pt", weights_only=True)["belief"]
     stage_1 = torch.load(repr_dir / "repr.pt", weights_only=True)
-    assert all(torch.equal(belief[f"history.{name}"], stage_1["norm"][name]) for name in stage_1["norm"])
+    for name, x in stage_1["norm"].items():
+        assert torch.equal(belief[f"history.{name.replace('image_', 'image.')}"], x)
 
 
 @pytest.mark.parametrize("warmup_updates", [2, 0])
@@ -124,12 +125,15 @@ def test_warm_up_then_the_teacher_acts_then_the_memory(
 
     def noted_warmup(model: torch.nn.ModuleDict, frames: dict, args: object) -> dict:
         assert frames["rgb"].shape == (32, 36, 36, 3) and model["teacher"].training
+        assert all(parameter.requires_grad for parameter in model.parameters())
         order.append("warm-up")
         return warmup_losses(model, frames, args)
 
     def noted_history(history: torch.nn.Module, batch: dict, *options: object) -> tuple:
         if options:  # not a validation
             order.append("memory" if options[1] is None else "teacher")
+            learning = {name.split(".")[0] for name, x in history.named_parameters() if x.requires_grad}
+            assert ("image" in learning) is (not warmup_updates) and "gru" in learning
         return encode_history(history, batch, *options)
 
     monkeypatch.setattr(module, "warmup_losses", noted_warmup)
