@@ -43,6 +43,10 @@ def test_gymnasium_task_draws_its_target_at_first_and_not_later(tmp_path: Path) 
     for first_picture, cue in zip(pixels[:, 0], episodes["cue"], strict=True):
         rows, columns = np.nonzero(first_picture)
         assert (columns.min(), rows.min()) == tuple(((cue + 1) * 28).astype(int)), "the cue is where the target is"
+    for method, script in (("believer", "ppo_believer"), ("ppo", "ppo_baseline")):
+        code, out, err = run("docs/examples/gymnasium_task", "--quick", "--method", method, cwd=tmp_path)
+        assert code == 0, out + err
+        assert (tmp_path / "runs" / f"RememberTarget-v0__{script}_quick__1" / "agent.pt").exists()
 
 
 def test_maniskill_task_shows_its_disc_at_first_and_not_later(tmp_path: Path) -> None:

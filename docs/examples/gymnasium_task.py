@@ -3,10 +3,11 @@
 A point moves in a square. Its target is drawn in the first pictures only, so the agent must remember where it was.
 
 Usage:   python docs/examples/gymnasium_task.py --small
-Takes:   the arguments that all three stages have: --seed, --device, --small and --quick
-Writes:  what the three stages write, to runs/RememberTarget-v0__...
+Takes:   --method aib, believer or ppo, and the arguments that all scripts have: --seed, --device, --small, --quick
+Writes:  what the method's scripts write, to runs/RememberTarget-v0__...
 """
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -17,8 +18,15 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 import aib_belief  # noqa: E402
 import aib_repr  # noqa: E402
 import ppo_aib  # noqa: E402
+import ppo_baseline  # noqa: E402
+import ppo_believer  # noqa: E402
 
 TASK = "RememberTarget-v0"
+SCRIPTS = {  # of each method, in order
+    "aib": (aib_repr, aib_belief, ppo_aib),
+    "believer": (aib_repr, ppo_believer),
+    "ppo": (ppo_baseline,),
+}
 GREEN, WHITE = (0, 255, 0), (255, 255, 255)
 
 
@@ -110,12 +118,15 @@ def check_envs(envs: gym.vector.VectorEnv, task: str) -> None:
 
 
 def main() -> None:
-    """Run the three stages one after another, with the arguments of the command line."""
-    sys.argv += ["--env-id", TASK]
-    for script in (aib_repr, ppo_aib):  # aib_belief.py has no simulator
-        script.make_envs = make_envs
+    """Run a method's scripts one after another, with the arguments of the command line."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--method", choices=SCRIPTS, default="aib")
+    chosen, others = parser.parse_known_args()
+    sys.argv[1:] = [*others, "--env-id", TASK]
+    scripts = SCRIPTS[chosen.method]
+    for script in scripts:
+        script.make_envs = make_envs  # not used by aib_belief.py, which has no simulator
         script.check_task = lambda args: None
-    scripts = (aib_repr, aib_belief, ppo_aib)
     arguments = [script.parse_args() for script in scripts]  # all before any runs: a mistake shows at once
     envs = make_envs(arguments[0])
     check_envs(envs, TASK)

@@ -4,10 +4,11 @@ The tool must go to a disc on the table. The disc is visible in the first five p
 where it was. PushCube-v1's cube lies there, too, and does not matter.
 
 Usage:   python docs/examples/maniskill_task.py --small
-Takes:   the arguments that all three stages have: --seed, --device, --small and --quick
-Writes:  what the three stages write, to runs/RememberDisc-v0__...
+Takes:   --method aib, believer or ppo, and the arguments that all scripts have: --seed, --device, --small, --quick
+Writes:  what the method's scripts write, to runs/RememberDisc-v0__...
 """
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -20,8 +21,15 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 import aib_belief  # noqa: E402
 import aib_repr  # noqa: E402
 import ppo_aib  # noqa: E402
+import ppo_baseline  # noqa: E402
+import ppo_believer  # noqa: E402
 
 TASK = "RememberDisc-v0"
+SCRIPTS = {  # of each method, in order
+    "aib": (aib_repr, aib_belief, ppo_aib),
+    "believer": (aib_repr, ppo_believer),
+    "ppo": (ppo_baseline,),
+}
 
 
 @register_env(TASK, max_episode_steps=50)
@@ -56,11 +64,14 @@ class RememberDisc(PushCubeEnv):
 
 
 def main() -> None:
-    """Run the three stages one after another, with the arguments of the command line."""
-    sys.argv += ["--env-id", TASK]
-    for script in (aib_repr, ppo_aib):  # aib_belief.py has no simulator
+    """Run a method's scripts one after another, with the arguments of the command line."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--method", choices=SCRIPTS, default="aib")
+    chosen, others = parser.parse_known_args()
+    sys.argv[1:] = [*others, "--env-id", TASK]
+    scripts = SCRIPTS[chosen.method]
+    for script in scripts:
         script.check_task = lambda args: None  # the scripts' own refuses tasks that are not MIKASA-Robo's
-    scripts = (aib_repr, aib_belief, ppo_aib)
     arguments = [script.parse_args() for script in scripts]  # all before any runs: a mistake shows at once
     for script, args in zip(scripts, arguments, strict=True):
         script.main(args)
