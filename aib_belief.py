@@ -314,35 +314,19 @@ class AIBBelief(nn.Module):
 # ---------------------------------------------------------------- losses
 
 
-def encode_history(
-    history: nn.Module, batch: dict[str, Tensor], mask: float = 0.0, teacher_memory: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """h (T+1, B, 256) and memory (T+1, B, 32) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J).
-
-    teacher_memory (T+1, B, 16), if given, stands in h for the half of the memory that asks; the GRU keeps its own.
-    """
+def encode_history(history: nn.Module, batch: dict[str, Tensor], mask: float = 0.0) -> tuple[Tensor, Tensor]:
+    """h (T+1, B, 256) and memory (T+1, B, 32) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J)."""
     num_steps, num_episodes = batch["rgb"].shape[:2]
     seen = [history.image(rgb, mask) for rgb in batch["rgb"].flatten(0, 1).split(IMAGE_CHUNK)]
-    keys, contents, keypoints, summary = (
-        torch.cat(x).unflatten(0, (num_steps, num_episodes)) for x in zip(*seen, strict=True)
-    )
-    hidden, memories, embedded = batch["joints"].new_zeros(num_episodes, 256), [], []
-    place = start = batch["joints"].new_zeros(num_episodes, 10)
+    seen = [torch.cat(x).unflatten(0, (num_steps, num_episodes)) for x in zip(*seen, strict=True)]
+    hidden, place = batch["joints"].new_zeros(num_episodes, 256), batch["joints"].new_zeros(num_episodes, 10)
+    memories, embedded = [], []
     for t in range(num_steps):
-        found = keys[t], contents[t], keypoints[t], summary[t]
-        memory, places, hidden, place = history.step(hidden, place, *found)
+        memory, places, hidden, place = history.step(hidden, place, *(x[t] for x in seen))
         memories.append(memory)
         embedded.append(places)
     memory = torch.stack(memories)
-    if teacher_memory is None:
-        return history.combine(memory, torch.stack(embedded), batch["joints"]), memory
-    taught, place, kept = torch.cat([teacher_memory, memory[..., 16:]], -1), start, []
-    asked, log_weights = history.ask(taught, keys, contents)  # at all steps at once: only keep is recurrent
-    for t in range(num_steps):
-        place = history.keep(asked[t], log_weights[t], place)
-        kept.append(place)
-    places = history.place(torch.cat([torch.stack(kept), keypoints], -1))
-    return history.combine(taught, places, batch["joints"]), memory
+    return history.combine(memory, torch.stack(embedded), batch["joints"]), memory
 
 
 def elbo_terms(belief: nn.Module, posterior: nn.Module, u: Tensor, h: Tensor) -> tuple[Tensor, ...]:
@@ -368,15 +352,13 @@ def flow_matching_loss(
     return (velocity - (action - noise)).square().sum(-1)
 
 
-def belief_losses(
-    model: nn.ModuleDict, batch: dict[str, Tensor], args: Args, teacher_acts: bool = False
-) -> dict[str, Tensor]:
+def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """L_Total = -L_VAE + lambda L_FM, with the KL in L_VAE weighted by beta, and its terms; means over the batch.
 
     batch: of EpisodeDataset. --fm-latent: z in L_FM is q's mean, or a sample of q (the paper's choice).
     --action-head mse: the squared error of the predicted action in place of L_FM; none: neither.
     """
-    h, other_losses = history_losses(model, batch, args, teacher_acts)
+    h, other_losses = history_losses(model, batch, args)
     nll, kl, z_sample, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
     losses = {"nll": nll.mean(), "kl": kl.mean(), **other_losses}
     losses["total"] = losses["nll"] + args.beta * losses["kl"] + args.prior_nll * losses["prior_nll"] + losses["memory"]
@@ -450,28 +432,21 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     return losses
 
 
-def history_losses(
-    model: nn.ModuleDict, batch: dict[str, Tensor], args: Args, teacher_acts: bool
-) -> tuple[Tensor, dict[str, Tensor]]:
+def history_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> tuple[Tensor, dict[str, Tensor]]:
     """h (T+1, B, 256) of whole episodes, and what trains it beside the ELBO; zeros where the arguments say so.
 
     prior_nll: -log p(u|z,h) with z from the prior. memory: 10 times its squared error from the teacher's.
-    teacher_acts: in h the teacher's memory takes the place of the GRU's, which learns to follow it.
     """
-    teacher_memory = None
+    h, memory = encode_history(model["belief"].history, batch, args.image_mask)
+    losses = {"prior_nll": h.new_zeros(()), "memory": h.new_zeros(())}
+    if args.prior_nll:
+        decoded = model["belief"].decode(h, torch.randn(*h.shape[:-1], 1, args.z_dim, device=h.device))
+        losses["prior_nll"] = -decoded.log_prob(batch["u"].unsqueeze(-2)).sum(-1).mean()
     if args.warmup_updates:  # the paper has no teacher
         num_steps, num_episodes = batch["u"].shape[:2]
         u_0 = batch["u"][0].expand_as(batch["u"]).flatten(0, 1)
         t = torch.arange(num_steps, device=u_0.device).repeat_interleave(num_episodes)
         teacher_memory = model["teacher"](u_0, t).detach().unflatten(0, (num_steps, num_episodes))
-    h, memory = encode_history(
-        model["belief"].history, batch, args.image_mask, teacher_memory if teacher_acts else None
-    )
-    losses = {"prior_nll": h.new_zeros(()), "memory": h.new_zeros(())}
-    if args.prior_nll:
-        decoded = model["belief"].decode(h, torch.randn(*h.shape[:-1], 1, args.z_dim, device=h.device))
-        losses["prior_nll"] = -decoded.log_prob(batch["u"].unsqueeze(-2)).sum(-1).mean()
-    if teacher_memory is not None:
         losses["memory"] = 10 * (memory[..., :16] - teacher_memory).square().sum(-1).mean()
     return h, losses
 
@@ -610,7 +585,7 @@ def main(args: Args) -> None:
             losses = warmup_losses(model, frames, args)
         else:
             batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
-            losses = belief_losses(model, batch, args, teacher_acts=args.warmup_updates > 0 and progress < 0.5)
+            losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()
         # one bad batch can erase what h remembers

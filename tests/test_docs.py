@@ -18,6 +18,7 @@ import true_state
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 OTHER_FLAGS = {"--no-index", "--color-words", "--logdir", "--help"}  # of git, TensorBoard, tyro
 OTHER_FLAGS |= {"--no-deps", "--ignore-requires-python", "--force-reinstall"}  # of pip
+OTHER_FLAGS |= {"--method"}  # of the examples
 
 
 def known_flags() -> set[str]:
