@@ -43,7 +43,3 @@ def test_links_files_and_flags_of_a_page(page: object) -> None:
         assert flag in known_flags(), f"{page.name} names {flag}"
     for target in re.findall(r"(?:^|`|sudo )make ([a-z-]+)", text, re.MULTILINE):
         assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), f"{page.name}: make {target}"
-
-
-def test_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text().split()) <= 800
