@@ -129,29 +129,6 @@ def orthogonal_init(module: nn.Module, gain: float = 2**0.5) -> nn.Module:
     return module
 
 
-class NatureCNN(nn.Module):
-    """The convolutional network of Mnih et al. (2015): images (B, H, W, C) float -> features (B, size), ReLU last."""
-
-    def __init__(self, image_shape: list[int], size: int, amp: bool):
-        super().__init__()
-        self.amp = amp  # in bfloat16
-        self.conv = nn.Sequential(
-            nn.Conv2d(image_shape[-1], 32, 8, stride=4),
-            nn.ReLU(),
-            nn.Conv2d(32, 64, 4, stride=2),
-            nn.ReLU(),
-            nn.Conv2d(64, 64, 3, stride=1),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
-        flat = self.conv(torch.zeros(1, *image_shape).permute(0, 3, 1, 2)).shape[1]
-        self.out = nn.Sequential(nn.Linear(flat, size), nn.ReLU())
-
-    def forward(self, images: Tensor) -> Tensor:
-        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.amp):
-            return self.out(self.conv(images.permute(0, 3, 1, 2))).float()
-
-
 class StateEncoder(nn.Module):
     """phi: privileged state (..., D), standardised inside, -> Normal over u (..., u_dim) (paper 3.1)."""
 
@@ -605,14 +582,14 @@ def main(args: Args) -> None:
             checkpoint = {"update": update, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
             save(path / "checkpoint.pt", checkpoint)
 
-    # the last weights, not the best on held-out episodes: those are from before the cue can be read from h
-    content = {**asdict(args), "config": config}
-    content |= {name: stored[name] for name in ("robot_triangles", "image_size")}
-    save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
     u, estimate = validate_belief(model["belief"], episodes, held_out)  # again: a resumed run may skip the loop
     for t in range(len(u)):
         writer.add_scalar("belief/held_out_u_r2_by_step", r_squared(u[t], estimate[t]), t)
     writer.close()
+    # the last weights, not the best on held-out episodes: those are from before the cue can be read from h
+    content = {**asdict(args), "config": config}
+    content |= {name: stored[name] for name in ("robot_triangles", "image_size")}
+    save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {r_squared(u[-1], estimate[-1]):.2f}")
 
 
