@@ -145,7 +145,8 @@ class StateEncoder(nn.Module):
 def attend(queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
     """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
 
-    Logits of normalised queries and keys lie in [-16, 16], enough to choose one of a thousand: no 1 / sqrt(16).
+    Without the usual 1 / sqrt(16), logits of normalised queries and keys lie in [-16, 16], and softmax can single out
+    one patch of a thousand.
     """
     queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
     log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
@@ -197,8 +198,10 @@ class ImageEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
+    """h_t of the observations o_0, ..., o_t: memory asks, the picture answers.
 
+    The paper (3.2) says only that a GRU summarises the history; this network is ours, as a flattened CNN memorises the
+    layouts of its training scenes.
     1. memory = code(state of the GRU before o_t), of which the first half asks.
     2. A query made of that half attends to the patches of o_t, which gives a place: coordinates and values. Where the
        attention is not sure, as the arm hides the object, the place stays the one of the step before.
@@ -213,7 +216,7 @@ class HistoryEncoder(nn.Module):
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
         self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
-        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; begins to trust it at 0.4
+        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; at first half sure at 0.4
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
         self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
@@ -334,11 +337,12 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
 
     batch: of EpisodeDataset. --fm-latent: z in L_FM is q's mean, or a sample of q (the paper's choice).
     --action-head mse: the squared error of the predicted action in place of L_FM; none: neither.
+    --prior-nll and --warmup-updates add a term each that the paper does not have.
     """
-    h, other_losses = history_losses(model, batch, args)
+    h, memory = encode_history(model["belief"].history, batch, args.image_mask)
     nll, kl, z_sample, z_mean = elbo_terms(model["belief"], model["posterior"], batch["u"], h)
-    losses = {"nll": nll.mean(), "kl": kl.mean(), **other_losses}
-    losses["total"] = losses["nll"] + args.beta * losses["kl"] + args.prior_nll * losses["prior_nll"] + losses["memory"]
+    losses = {"nll": nll.mean(), "kl": kl.mean()}
+    losses["total"] = losses["nll"] + args.beta * losses["kl"]
     if args.action_head != "none":
         latent = z_mean if args.fm_latent == "mean" else z_sample
         action, z, z_next = batch["actions"], latent[:-1], latent[1:]
@@ -348,11 +352,18 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
         else:
             losses["action"] = (model["head"](torch.cat([z, z_next], -1)) - action).square().sum(-1).mean()
         losses["total"] = losses["total"] + args.action_lambda * losses["action"]
+    if args.prior_nll:
+        losses["prior_nll"] = prior_nll_loss(model["belief"], batch["u"], h)
+        losses["total"] = losses["total"] + args.prior_nll * losses["prior_nll"]
+    if args.warmup_updates:
+        losses["memory"] = memory_loss(model["teacher"], batch["u"], memory)
+        losses["total"] = losses["total"] + 10 * losses["memory"]
     return losses
 
 
 # ---------------------------------------------------------------- warm-up
-# not in the paper, and off unless --warmup-updates is given, as by --small: how attention learns to find objects
+# not in the paper, and off unless --warmup-updates or --prior-nll is given, as by --small: how attention learns to find
+# objects, and what else trains the belief then
 
 
 class Teacher(nn.Module):
@@ -401,7 +412,7 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
         losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
     located = model["locator"](contents)
-    # detached: trained on all patches, the locator would tell u of any of them, and the attention would learn nothing
+    # mean detached: else the locator would learn to predict u from every patch, and the attention nothing
     log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
     losses["locator"] = (model["locator"](place.detach()).mean - u).square().sum(-1).mean()
     losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
@@ -409,23 +420,18 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     return losses
 
 
-def history_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> tuple[Tensor, dict[str, Tensor]]:
-    """h (T+1, B, 256) of whole episodes, and what trains it beside the ELBO; zeros where the arguments say so.
+def prior_nll_loss(belief: nn.Module, u: Tensor, h: Tensor) -> Tensor:
+    """-log p(u|z,h) with z from the prior, which is what the robot has: u (..., u_dim), h (..., 256) -> mean ()."""
+    decoded = belief.decode(h, torch.randn(*h.shape[:-1], 1, belief.config["z_dim"], device=h.device))
+    return -decoded.log_prob(u.unsqueeze(-2)).sum(-1).mean()
 
-    prior_nll: -log p(u|z,h) with z from the prior. memory: 10 times its squared error from the teacher's.
-    """
-    h, memory = encode_history(model["belief"].history, batch, args.image_mask)
-    losses = {"prior_nll": h.new_zeros(()), "memory": h.new_zeros(())}
-    if args.prior_nll:
-        decoded = model["belief"].decode(h, torch.randn(*h.shape[:-1], 1, args.z_dim, device=h.device))
-        losses["prior_nll"] = -decoded.log_prob(batch["u"].unsqueeze(-2)).sum(-1).mean()
-    if args.warmup_updates:  # the paper has no teacher
-        num_steps, num_episodes = batch["u"].shape[:2]
-        u_0 = batch["u"][0].expand_as(batch["u"]).flatten(0, 1)
-        t = torch.arange(num_steps, device=u_0.device).repeat_interleave(num_episodes)
-        teacher_memory = model["teacher"](u_0, t).detach().unflatten(0, (num_steps, num_episodes))
-        losses["memory"] = 10 * (memory[..., :16] - teacher_memory).square().sum(-1).mean()
-    return h, losses
+
+def memory_loss(teacher: nn.Module, u: Tensor, memory: Tensor) -> Tensor:
+    """Squared error of the half of the memory (T+1, B, 32) that asks from the teacher's: u (T+1, B, u_dim) -> ()."""
+    num_frames, num_episodes = u.shape[:2]
+    t = torch.arange(num_frames, device=u.device).repeat_interleave(num_episodes)
+    wanted = teacher(u[0].repeat(num_frames, 1), t).detach().unflatten(0, (num_frames, num_episodes))
+    return (memory[..., :16] - wanted).square().sum(-1).mean()
 
 
 # ---------------------------------------------------------------- data
@@ -552,7 +558,7 @@ def main(args: Args) -> None:
         # falls to 0 over the second half of each phase, which lowers the error of the last weights
         optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - progress))
         model["teacher"].train(warming_up)  # later its statistics stay what they are
-        # after a warm-up it stays as it is, which makes an update twice as fast
+        # the image encoder is frozen after a warm-up, which makes an update twice as fast; without one it always learns
         history.image.requires_grad_(warming_up or not args.warmup_updates)
         if warming_up:
             episode = rng.choice(train, 8 * args.batch_episodes)
@@ -570,10 +576,10 @@ def main(args: Args) -> None:
         optimizer.step()
         if update % 10 == 0:
             for name, value in losses.items():
-                writer.add_scalar(f"belief/{name}", value, update)
+                writer.add_scalar(f"{'warmup' if warming_up else 'belief'}/{name}", value, update)
 
         if update % VAL_EVERY == 0 or update == num_updates:
-            if not warming_up:  # before there is no memory to validate
+            if not warming_up:  # which trains no memory
                 u, estimate = validate_belief(model["belief"], episodes, held_out)
                 error = (u - estimate).square().sum(-1).mean().item()
                 writer.add_scalar("belief/held_out_error", error, update)

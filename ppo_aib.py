@@ -229,7 +229,8 @@ class NatureCNN(nn.Module):
 def attend(queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
     """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
 
-    Logits of normalised queries and keys lie in [-16, 16], enough to choose one of a thousand: no 1 / sqrt(16).
+    Without the usual 1 / sqrt(16), logits of normalised queries and keys lie in [-16, 16], and softmax can single out
+    one patch of a thousand.
     """
     queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
     log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
@@ -281,8 +282,10 @@ class ImageEncoder(nn.Module):
 
 
 class HistoryEncoder(nn.Module):
-    """h_t of the observations o_0, ..., o_t (paper 3.2): memory asks, the picture answers.
+    """h_t of the observations o_0, ..., o_t: memory asks, the picture answers.
 
+    The paper (3.2) says only that a GRU summarises the history; this network is ours, as a flattened CNN memorises the
+    layouts of its training scenes.
     1. memory = code(state of the GRU before o_t), of which the first half asks.
     2. A query made of that half attends to the patches of o_t, which gives a place: coordinates and values. Where the
        attention is not sure, as the arm hides the object, the place stays the one of the step before.
@@ -297,7 +300,7 @@ class HistoryEncoder(nn.Module):
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
         self.code = nn.Linear(256, 16 + 16)
         self.query = orthogonal_init(mlp([16, 64, 16]))
-        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; begins to trust it at 0.4
+        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; at first half sure at 0.4
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
         self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
