@@ -95,8 +95,6 @@ class Args:
     """lambda_o"""
     kl_coef: float = 0.03
     """lambda_KL, of the KL's mean over u's dimensions, as in Believer's code"""
-    psi_images: bool = True
-    """psi sees image and joints, as in the paper; without images a CPU is many times faster"""
     amp: bool = BFLOAT16
     """image network in bfloat16"""
 
@@ -185,25 +183,20 @@ class StateEncoder(nn.Module):
 
 
 class ObservationEncoder(nn.Module):
-    """psi: rgb (B, H, W, 3) uint8 and joints (B, J), standardised inside, -> Normal over u^o (B, u_dim) (paper 3.1).
+    """psi: rgb (B, H, W, 3) uint8 and joints (B, J), standardised inside, -> Normal over u^o (B, u_dim) (paper 3.1)."""
 
-    images: False for a psi of the joints alone, which is many times faster on a CPU; rgb may then be None.
-    """
-
-    def __init__(self, image_shape: list[int], joints_dim: int, u_dim: int, images: bool = True, amp: bool = False):
+    def __init__(self, image_shape: list[int], joints_dim: int, u_dim: int, amp: bool = False):
         super().__init__()
         self.register_buffer("image_mean", torch.zeros(image_shape))
         self.register_buffer("image_std", torch.tensor(255.0))
         self.register_buffer("joints_mean", torch.zeros(joints_dim))
         self.register_buffer("joints_std", torch.ones(joints_dim))
-        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, amp)) if images else None
-        self.net = GaussianMLP(joints_dim + (256 if images else 0), [256, 256], u_dim, min_std=1e-5)
+        self.cnn = orthogonal_init(NatureCNN(image_shape, 256, amp))
+        self.net = GaussianMLP(256 + joints_dim, [256, 256], u_dim, min_std=1e-5)
 
     def forward(self, rgb: Tensor, joints: Tensor) -> Normal:
-        x = (joints - self.joints_mean) / self.joints_std
-        if self.cnn:
-            x = torch.cat([self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std)), x], -1)
-        return self.net(x)
+        image = self.cnn(rgb.float().sub_(self.image_mean).div_(self.image_std))
+        return self.net(torch.cat([image, (joints - self.joints_mean) / self.joints_std], -1))
 
 
 class Predictor(nn.Module):
@@ -227,10 +220,10 @@ class Predictor(nn.Module):
 def repr_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
     """The terms of Algorithm 1 for a batch of transitions (B, ...), each a mean over the batch."""
     phi, psi, g = model["phi"], model["psi"], model["g"]
-    q_s, q_o = phi(batch["state"]), psi(batch.get("rgb"), batch["joints"])
+    q_s, q_o = phi(batch["state"]), psi(batch["rgb"], batch["joints"])
     r_hat, s_hat, o_hat = g(q_s.rsample(), q_o.rsample(), batch["actions"])  # lines 4 and 5
     with torch.no_grad():  # line 6; the mean of a target gives the gradient of a sample with less noise
-        s_next, o_next = phi(batch["next_state"]).mean, psi(batch.get("next_rgb"), batch["next_joints"]).mean
+        s_next, o_next = phi(batch["next_state"]).mean, psi(batch["next_rgb"], batch["next_joints"]).mean
     loss_r = ((batch["rewards"] - g.reward_mean) / g.reward_std - r_hat).square().mean()  # line 7
     loss_s = (s_next - s_hat).square().sum(-1).mean()  # line 8
     loss_o = (o_next - o_hat).square().sum(-1).mean()  # line 9
@@ -311,13 +304,11 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
 
 
 class TransitionDataset:
-    """Transitions of dataset/, with or without images, on the disk, or on the GPU where they fit there."""
+    """Transitions of dataset/, on the disk, or on the GPU where they fit there."""
 
-    def __init__(self, dataset: Path, images: bool, device: str):
+    def __init__(self, dataset: Path, device: str):
         self.device, self.arrays = device, {}
-        self.with_next = ["joints", "state"]  # arrays of T+1 steps, of which a transition has two
-        if images:
-            self.with_next.append("rgb")
+        self.with_next = ["rgb", "joints", "state"]  # arrays of T+1 steps, of which a transition has two
         for name in (*self.with_next, "actions", "rewards"):
             x = torch.from_numpy(np.load(dataset / f"{name}.npy", mmap_mode="c"))  # torch warns of read-only arrays
             fits = device == "cuda" and x.nbytes < torch.cuda.mem_get_info()[0] / 2
@@ -349,16 +340,14 @@ def main(args: Args) -> None:
             if found[name] != getattr(args, name):
                 fail(f"{meta.parent} has {name} {found[name]}, this run needs {getattr(args, name)}")
     arrays = collect_random_episodes(args, path / "dataset")
-    transitions = TransitionDataset(path / "dataset", args.psi_images, args.device)
+    transitions = TransitionDataset(path / "dataset", args.device)
     num_val = max(4, args.num_episodes // 10)  # held out from stages 1 and 2: the last ones
     train = {name: x[:-num_val] for name, x in arrays.items()}
     steps, action_dim = arrays["actions"].shape[1:]
 
     torch.manual_seed(args.seed)
     phi = StateEncoder(arrays["state"].shape[-1], args.u_dim)
-    psi = ObservationEncoder(
-        list(arrays["rgb"].shape[2:]), arrays["joints"].shape[-1], args.u_dim, args.psi_images, args.amp
-    )
+    psi = ObservationEncoder(list(arrays["rgb"].shape[2:]), arrays["joints"].shape[-1], args.u_dim, args.amp)
     g = Predictor(args.u_dim, action_dim)
     for name, mean, std in (("state", phi.mean, phi.std), ("joints", psi.joints_mean, psi.joints_std)):
         mean.copy_(torch.from_numpy(train[name].mean((0, 1), dtype=np.float64)))

@@ -110,7 +110,7 @@ def test_transitions_lie_within_an_episode_and_each_is_learnt_from_once_an_epoch
 ) -> None:
     dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
     arrays = {file.stem: np.load(file) for file in dataset.glob("*.npy")}
-    batch = aib_repr.TransitionDataset(dataset, True, "cpu")(np.array([0, 9, 10, 199]))
+    batch = aib_repr.TransitionDataset(dataset, "cpu")(np.array([0, 9, 10, 199]))
     for row, (episode, t) in enumerate([(0, 0), (0, 9), (1, 0), (19, 9)]):
         for name in ("rgb", "joints", "state", "actions", "rewards"):
             assert np.array_equal(batch[name][row], arrays[name][episode, t]), name
@@ -435,20 +435,6 @@ def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_
     assert torch.allclose(model["phi.std"], state.std((0, 1), correction=0).clip(0.05), atol=1e-5)
 
 
-def test_psi_without_images_sees_the_joints_alone(toy_stages: Path) -> None:
-    psi = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4, images=False)
-    assert not any("cnn" in name for name, _ in psi.named_parameters())
-    q, other = psi(None, torch.zeros(2, 7)), psi(None, torch.ones(2, 7))
-    assert q.mean.shape == (2, 4) and not torch.allclose(q.mean, other.mean)
-    dataset = toy_stages / f"{TOY}__aib_repr__1" / "dataset"
-    batch = aib_repr.TransitionDataset(dataset, False, "cpu")(np.array([3, 4]))
-    assert set(batch) == {"joints", "state", "actions", "rewards", "next_joints", "next_state"}
-    psi = aib_repr.ObservationEncoder(tuple(IMAGE), 3, 4, images=False)
-    model = nn.ModuleDict({"phi": aib_repr.StateEncoder(4, 4), "psi": psi, "g": aib_repr.Predictor(4, 2)})
-    aib_repr.repr_losses(model, batch, REPR_ARGS)["total"].backward()
-    assert all(parameter.grad is not None for parameter in model.parameters())
-
-
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:
     psi, history = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4), aib_belief.HistoryEncoder(CONFIG)
     rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.randn(2, 7)
@@ -467,12 +453,13 @@ def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> N
 
 
 def test_state_and_joints_are_standardised_in_phi_and_psi() -> None:
-    phi, psi = aib_repr.StateEncoder(5, 4), aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4, images=False)
+    phi, psi = aib_repr.StateEncoder(5, 4), aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4)
     state, joints = torch.randn(B, 5), torch.randn(B, 7)
-    plain, plain_joints = phi(state).mean, psi(None, joints).mean
+    rgb = torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8)
+    plain, plain_joints = phi(state).mean, psi(rgb, joints).mean
     phi.mean.fill_(3.0), phi.std.fill_(2.0), psi.joints_mean.fill_(3.0), psi.joints_std.fill_(2.0)
     assert torch.allclose(phi(2 * state + 3).mean, plain, atol=1e-5)
-    assert torch.allclose(psi(None, 2 * joints + 3).mean, plain_joints, atol=1e-5)
+    assert torch.allclose(psi(rgb, 2 * joints + 3).mean, plain_joints, atol=1e-5)
     gaussian = aib_repr.GaussianMLP(5, [8], 4, min_std=0.1)
     nn.init.constant_(gaussian.net[-1].bias, -100.0)
     assert torch.allclose(gaussian(state).stddev, torch.tensor(0.1))
