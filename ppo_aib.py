@@ -11,6 +11,7 @@ Writes:  runs/{env_id}__{exp_name}__{seed}/: agent.pt, eval.csv, videos/, Tensor
          checkpoint.pt to resume; with --evaluate evaluation.json and .mp4 beside agent.pt
 """
 
+import contextlib
 import difflib
 import fcntl
 import json
@@ -901,7 +902,15 @@ def run_stage(script: str, args: Args, flags: list[str]) -> None:
     for name in ["env_id", "seed", "device", *flags]:
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     print(f"an earlier stage comes first:\n  {shlex.join(command)}", flush=True)
-    status = subprocess.run(command).returncode
+    process = subprocess.Popen(command)
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=10)  # Ctrl-C reaches the stage, too; subprocess.run would kill it at once
+        process.terminate()  # a scheduler's signal may not have reached it
+        process.wait()
+        raise
     if status < 0:
         fail(f"{script} was killed by signal {-status}, perhaps as memory ran out; the same command goes on")
     if status:

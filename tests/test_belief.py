@@ -167,7 +167,7 @@ def test_earlier_stages_get_what_they_need_to_know(
     toy_task: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     commands, status = [], 0
-    monkeypatch.setattr(subprocess, "run", lambda x: commands.append(x) or SimpleNamespace(returncode=status))
+    monkeypatch.setattr(subprocess, "Popen", lambda x: commands.append(x) or SimpleNamespace(wait=lambda: status))
     same = dict(env_id="RememberColor3-v0", seed=3, small=True)
     simulator = dict(robot_triangles=0, image_size=40, num_workers=5)
     for module, scripts in ((ppo_aib, (aib_repr, aib_belief)),):
