@@ -36,6 +36,8 @@ class Args:
     """also the action heads and loss weights on InterceptFast-v0, where it is among the tasks"""
     small: bool = False
     """with the scripts' --small, and plain PPO also with as many steps as AIB has with its random episodes"""
+    delete_pictures: bool = False
+    """delete a block's pictures, gigabytes, once its beliefs are trained and probed; not those that ablations need"""
     phase: Literal[1, 2, 3] | None = None
     """only the commands of this stage"""
 
@@ -51,8 +53,8 @@ def block(args: Args, task: str, seed: int) -> Iterator[tuple[int, str]]:
         yield from tests(f"runs/{task}__{method}{suffix}__{seed}", f"{method}.py {run}")
     for script in ("aib_belief", "ppo_believer"):
         yield from probes(f"runs/{task}__{script}{suffix}__{seed}")
-    if not (args.ablations and task == ABLATED):
-        yield 4, f"rm -f runs/{task}__aib_repr{suffix}__{seed}/dataset/rgb.npy"  # gigabytes that no later command reads
+    if args.delete_pictures and not (args.ablations and task == ABLATED):
+        yield 4, f"rm -f runs/{task}__aib_repr{suffix}__{seed}/dataset/rgb.npy"
     if args.small:
         own, equal = (f"runs/{task}__{name}__{seed}" for name in ("ppo_baseline_small", "ppo_baseline_equal"))
         more = 4000 * (90 if task.startswith("Intercept") else 60)  # steps of the random episodes

@@ -171,7 +171,7 @@ def test_nothing_to_report(tmp_path: Path, capsys: pytest.CaptureFixture) -> Non
 def test_every_command_of_the_matrix_is_one_the_scripts_accept() -> None:
     scripts = {f"{name}.py": __import__(name).Args for name in SCRIPTS}
     scripts |= {"benchmark/belief.py": belief.Args, "benchmark/diagnose_agent.py": diagnose_agent.Args}
-    for flags in ([], ["--small", "--seeds", "11"]):
+    for flags in ([], ["--small", "--delete-pictures", "--seeds", "11"]):
         experiment = [sys.executable, str(ROOT / "benchmark" / "experiments.py"), *flags]
         printed = subprocess.run(experiment, capture_output=True, text=True)
         assert printed.returncode == 0
