@@ -101,7 +101,7 @@ class Args:
     image_mask: float = 0.25
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
     warmup_updates: int = 0
-    """updates on single frames before those, with a teacher that knows u_0 for a memory; 0: none, as in the paper"""
+    """updates on single frames before those, where a teacher that knows u_0 asks for the memory; 0: as in the paper"""
     prior_nll: float = 0.0
     """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
 
