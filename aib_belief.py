@@ -76,6 +76,8 @@ class Args:
     """z in L_FM: the mean of q; or a sample of q, which is the paper's choice and mostly noise at first"""
     image_mask: float = 0.25
     """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
+    occlusion: float = 0.5
+    """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
     warmup_updates: int = 0
     """updates on single frames before those, where a teacher that knows u_0 asks for the memory; 0: as in the paper"""
     prior_nll: float = 0.0
@@ -420,6 +422,31 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     return losses
 
 
+@torch.no_grad()
+def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, rng: np.random.Generator) -> None:
+    """In a share of episodes hide the place that the teacher asks for, from a random step on, as the arm hides objects.
+
+    Changes rgb (T+1, B, H, W, 3), a copy of the dataset's: a rectangle of one colour, as wide and high as a quarter to
+    a half of the picture.
+    """
+    rgb, history = batch["rgb"], model["belief"].history
+    episodes = np.flatnonzero(rng.random(rgb.shape[1]) < share)
+    if not len(episodes):
+        return
+    t = rng.integers(len(rgb), size=len(episodes))
+    memory = model["teacher"](batch["u"][0, episodes], torch.from_numpy(t).to(rgb.device))
+    keys, contents, *_ = history.image(rgb[t, episodes])
+    place, _ = history.ask(memory, keys, contents)
+    size = np.array(rgb.shape[2:4])
+    centres = (place[:, :2].cpu().numpy() + 1) / 2 * size
+    for step, episode, centre in zip(t, episodes, centres, strict=True):
+        half = rng.integers(size // 8, size // 4)
+        top, left = (centre - half).clip(0).astype(int)
+        bottom, right = (centre + half).astype(int)
+        colour = torch.from_numpy(rng.integers(256, size=3, dtype=np.uint8)).to(rgb.device)
+        rgb[step:, episode, top:bottom, left:right] = colour
+
+
 def prior_nll_loss(belief: nn.Module, u: Tensor, h: Tensor) -> Tensor:
     """-log p(u|z,h) with z from the prior, which is what the robot has: u (..., u_dim), h (..., 256) -> mean ()."""
     decoded = belief.decode(h, torch.randn(*h.shape[:-1], 1, belief.config["z_dim"], device=h.device))
@@ -568,6 +595,8 @@ def main(args: Args) -> None:
             losses = warmup_losses(model, frames, args)
         else:
             batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
+            if args.warmup_updates:  # else the teacher knows nothing
+                hide_objects(model, batch, args.occlusion, rng)
             losses = belief_losses(model, batch, args)
         optimizer.zero_grad()
         losses["total"].backward()

@@ -138,13 +138,16 @@ def test_warm_up_then_whole_episodes(
 
     monkeypatch.setattr(module, "warmup_losses", noted_warmup)
     monkeypatch.setattr(module, "encode_history", noted_history)
+    hide_objects = module.hide_objects
+    monkeypatch.setattr(module, "hide_objects", lambda *arguments: (order.append("hide"), hide_objects(*arguments)))
     sizes = dict(warmup_updates=warmup_updates, num_updates=4, batch_episodes=4, belief_lr=1e-3)
     if script == "ppo_believer":
         sizes |= dict(num_envs=4, total_timesteps=40, num_minibatches=2, num_eval_episodes=2)
     train(module, repr_dir=str(toy_stages / f"{TOY}__aib_repr__1"), **sizes)
-    assert order == ["warm-up"] * warmup_updates + ["episodes"] * 4
     if not warmup_updates:
+        assert order == ["episodes"] * 4, "an untrained teacher hides nothing"
         return
+    assert order == ["warm-up"] * 2 + ["hide", "episodes"] * 4
     assert rates[:6] == pytest.approx([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 5e-4]), "falls over the second half"
 
 

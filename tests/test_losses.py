@@ -581,3 +581,24 @@ def test_ppo_losses_are_the_closed_forms() -> None:
     assert torch.allclose(losses["total"], total)
     one = {name: x[:1] for name, x in batch.items()}  # a minibatch of one step, as --num-envs 1 may leave
     assert ppo_aib.ppo_losses(lambda _: (Normal(mean[:1], 1.0), value[:1]), one, args)["total"].isfinite()
+
+
+def test_objects_are_hidden_until_the_end() -> None:
+    model, batch = belief_model(), belief_batch()
+    history, episodes = model["belief"].history, 40
+    batch = {"rgb": torch.full((20, episodes, *IMAGE), 7, dtype=torch.uint8), "u": torch.randn(20, episodes, 4)}
+    place = torch.zeros(1, 10)
+    place[:, :2] = torch.tensor([0.0, 0.5])  # in the middle of the rows, at three quarters of the columns
+    history.ask = lambda memory, keys, contents: (place.expand(len(memory), -1), None)
+    aib_belief.hide_objects(model, batch, 0.5, np.random.default_rng(0))
+    hidden = (batch["rgb"] != 7).any(-1)
+    assert 10 < hidden.any((0, 2, 3)).sum() < 30, "half of the episodes"
+    for episode in range(episodes):
+        seen = hidden[:, episode]
+        steps = seen.flatten(1).any(1).nonzero().flatten().tolist()
+        if steps:
+            assert steps == list(range(steps[0], 20)) and torch.equal(seen[steps[0]], seen[-1])
+            rows, columns = seen[-1].any(1), seen[-1].any(0)
+            assert 8 <= rows.sum() < 18 and 8 <= columns.sum() < 18 and rows[18] and columns[27]
+            assert torch.equal(seen[-1], rows[:, None] & columns), "a rectangle"
+            assert len(batch["rgb"][-1, episode][seen[-1]].unique(dim=0)) == 1, "of one colour"
