@@ -144,13 +144,18 @@ class StateEncoder(nn.Module):
         return self.net((state - self.mean) / self.std)
 
 
+KEY_DIM = 16  # of a query, and of the keys that it is compared with
+PLACE_DIM = 2 + 8  # coordinates and values of what a query finds
+MEMORY_DIM = 32  # of which the first KEY_DIM ask
+
+
 def attend(queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
     """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
 
     Without the usual 1 / sqrt(16), logits of normalised queries and keys lie in [-16, 16], and softmax can single out
     one patch of a thousand.
     """
-    queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
+    queries, keys = nn.functional.layer_norm(queries, [KEY_DIM]), nn.functional.layer_norm(keys, [KEY_DIM])
     log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
     return log_weights.exp() @ contents, log_weights
 
@@ -172,9 +177,9 @@ class ImageEncoder(nn.Module):
             lines = [torch.linspace(-1, 1, length // size) for length in (height, width)]
             self.register_buffer(name, torch.cartesian_prod(*lines))
         self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
-        self.token_heads = nn.Linear(64, 16 + 8 + 32)
-        self.point = orthogonal_init(mlp([3 * self.block**2, 32, 16]))
-        self.point_queries = nn.Parameter(torch.randn(8, 16))
+        self.token_heads = nn.Linear(64, KEY_DIM + 8 + 32)
+        self.point = orthogonal_init(mlp([3 * self.block**2, 32, KEY_DIM]))
+        self.point_queries = nn.Parameter(torch.randn(8, KEY_DIM))
 
     def forward(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
@@ -190,7 +195,7 @@ class ImageEncoder(nn.Module):
             images = images.clone()  # the keypoints' stay as they are
             images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
         tokens = self.token(self.cut(images, self.patch))
-        keys, values, features = self.token_heads(tokens).split([16, 8, 32], -1)
+        keys, values, features = self.token_heads(tokens).split([KEY_DIM, 8, 32], -1)
         contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
         return keys, contents, keypoints.flatten(1), features.relu().amax(1)
 
@@ -216,19 +221,19 @@ class HistoryEncoder(nn.Module):
         self.image = ImageEncoder(config["image_shape"])
         self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
-        self.code = nn.Linear(256, 16 + 16)
-        self.query = orthogonal_init(mlp([16, 64, 16]))
+        self.code = nn.Linear(256, MEMORY_DIM)
+        self.query = orthogonal_init(mlp([KEY_DIM, 64, KEY_DIM]))
         self.sure = nn.Linear(1, 1)  # of the attention's largest weight; at first half sure at 0.4
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
-        self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
-        self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
+        self.place = orthogonal_init(mlp([PLACE_DIM + 8 * 2, 64, 64]))
+        self.out = orthogonal_init(mlp([MEMORY_DIM + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
         self.gru = nn.GRUCell(64 + 32, 256)
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory (..., 32), of which the first 16 ask -> place (..., 10), log weights of the patches (..., N)."""
-        place, log_weights = attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
+        """Memory (..., 32), of which the first KEY_DIM ask -> place (..., 10), log weights of the patches (..., N)."""
+        place, log_weights = attend(self.query(memory[..., :KEY_DIM]).unsqueeze(-2), keys, contents)
         return place.squeeze(-2), log_weights.squeeze(-2)
 
     def keep(self, place: Tensor, log_weights: Tensor, before: Tensor) -> Tensor:
@@ -259,8 +264,8 @@ class HistoryEncoder(nn.Module):
         The recurrent state is the GRU's and the place, (B, 256 + 10).
         """
         if recurrent is None:
-            recurrent = joints.new_zeros(len(rgb), 256 + 10)
-        memory, embedded, *after = self.step(*recurrent.split([256, 10], -1), *self.image(rgb))
+            recurrent = joints.new_zeros(len(rgb), 256 + PLACE_DIM)
+        memory, embedded, *after = self.step(*recurrent.split([256, PLACE_DIM], -1), *self.image(rgb))
         return self.combine(memory, embedded, joints), torch.cat(after, -1)
 
 
@@ -301,7 +306,7 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], mask: float = 0
     num_steps, num_episodes = batch["rgb"].shape[:2]
     seen = [history.image(rgb, mask) for rgb in batch["rgb"].flatten(0, 1).split(IMAGE_CHUNK)]
     seen = [torch.cat(x).unflatten(0, (num_steps, num_episodes)) for x in zip(*seen, strict=True)]
-    hidden, place = batch["joints"].new_zeros(num_episodes, 256), batch["joints"].new_zeros(num_episodes, 10)
+    hidden, place = batch["joints"].new_zeros(num_episodes, 256), batch["joints"].new_zeros(num_episodes, PLACE_DIM)
     memories, embedded = [], []
     for t in range(num_steps):
         memory, places, hidden, place = history.step(hidden, place, *(x[t] for x in seen))
@@ -374,7 +379,7 @@ class Teacher(nn.Module):
     def __init__(self, u_dim: int):
         super().__init__()
         self.standardise = nn.BatchNorm1d(u_dim, eps=0.05**2, affine=False)  # as if each std were at least 0.05
-        self.net = orthogonal_init(mlp([u_dim + 1, 64, 16]))
+        self.net = orthogonal_init(mlp([u_dim + 1, 64, KEY_DIM]))
 
     def forward(self, u_0: Tensor, t: Tensor) -> Tensor:
         return self.net(torch.cat([self.standardise(u_0), t.log1p().unsqueeze(-1)], -1))
@@ -385,7 +390,7 @@ class Locator(nn.Module):
 
     def __init__(self, u_dim: int):
         super().__init__()
-        self.mean = orthogonal_init(mlp([2 + 8, 64, u_dim]))
+        self.mean = orthogonal_init(mlp([PLACE_DIM, 64, u_dim]))
         self.raw_std = nn.Parameter(torch.zeros(u_dim))
 
     def forward(self, contents: Tensor) -> Normal:
@@ -458,7 +463,7 @@ def memory_loss(teacher: nn.Module, u: Tensor, memory: Tensor) -> Tensor:
     num_frames, num_episodes = u.shape[:2]
     t = torch.arange(num_frames, device=u.device).repeat_interleave(num_episodes)
     wanted = teacher(u[0].repeat(num_frames, 1), t).detach().unflatten(0, (num_frames, num_episodes))
-    return (memory[..., :16] - wanted).square().sum(-1).mean()
+    return (memory[..., :KEY_DIM] - wanted).square().sum(-1).mean()
 
 
 # ---------------------------------------------------------------- data
@@ -489,6 +494,8 @@ class EpisodeDataset:
 
 def load_episodes(args: Args, **expected: object) -> tuple[EpisodeDataset, dict]:
     """Open stage 1's output: episodes with u = mean of phi(s), and repr.pt, checked by load."""
+    if args.batch_episodes < 1 or args.image_mask >= 1:
+        fail(f"--batch-episodes {args.batch_episodes} must be at least 1, --image-mask {args.image_mask} below 1")
     preset = "small" if args.small else "quick" if args.quick else ""
     suffix, flag = (f"_{preset}", f"--{preset}") if preset else ("", "")
     path = Path(args.repr_dir or f"runs/{args.env_id}__aib_repr{suffix}__{args.seed}")
@@ -553,7 +560,8 @@ def main(args: Args) -> None:
     model = nn.ModuleDict({"belief": AIBBelief(config)})
     # belief.pt holds the belief alone; all else serves its training
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
-    model["teacher"], model["locator"] = Teacher(config["u_dim"]), Locator(config["u_dim"])
+    if args.warmup_updates:
+        model["teacher"], model["locator"] = Teacher(config["u_dim"]), Locator(config["u_dim"])
     if args.action_head != "none":
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
         model["head"] = mlp([inputs, 256, action_dim])
@@ -584,9 +592,9 @@ def main(args: Args) -> None:
             progress = (update - args.warmup_updates - 1) / args.num_updates
         # falls to 0 over the second half of each phase, which lowers the error of the last weights
         optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - progress))
-        model["teacher"].train(warming_up)  # later its statistics stay what they are
-        # the image encoder is frozen after a warm-up, which makes an update twice as fast; without one it always learns
-        history.image.requires_grad_(warming_up or not args.warmup_updates)
+        if args.warmup_updates:  # after it what finds and asks stays as it is, which makes an update twice as fast
+            history.image.requires_grad_(warming_up)
+            model["teacher"].train(warming_up)
         if warming_up:
             episode = rng.choice(train, 8 * args.batch_episodes)
             # early steps more often (density t^(-1/3)), as they show what is to be remembered

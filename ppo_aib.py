@@ -227,13 +227,18 @@ class NatureCNN(nn.Module):
             return self.out(self.conv(images.permute(0, 3, 1, 2))).float()
 
 
+KEY_DIM = 16  # of a query, and of the keys that it is compared with
+PLACE_DIM = 2 + 8  # coordinates and values of what a query finds
+MEMORY_DIM = 32  # of which the first KEY_DIM ask
+
+
 def attend(queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
     """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
 
     Without the usual 1 / sqrt(16), logits of normalised queries and keys lie in [-16, 16], and softmax can single out
     one patch of a thousand.
     """
-    queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
+    queries, keys = nn.functional.layer_norm(queries, [KEY_DIM]), nn.functional.layer_norm(keys, [KEY_DIM])
     log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
     return log_weights.exp() @ contents, log_weights
 
@@ -255,9 +260,9 @@ class ImageEncoder(nn.Module):
             lines = [torch.linspace(-1, 1, length // size) for length in (height, width)]
             self.register_buffer(name, torch.cartesian_prod(*lines))
         self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
-        self.token_heads = nn.Linear(64, 16 + 8 + 32)
-        self.point = orthogonal_init(mlp([3 * self.block**2, 32, 16]))
-        self.point_queries = nn.Parameter(torch.randn(8, 16))
+        self.token_heads = nn.Linear(64, KEY_DIM + 8 + 32)
+        self.point = orthogonal_init(mlp([3 * self.block**2, 32, KEY_DIM]))
+        self.point_queries = nn.Parameter(torch.randn(8, KEY_DIM))
 
     def forward(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
@@ -273,7 +278,7 @@ class ImageEncoder(nn.Module):
             images = images.clone()  # the keypoints' stay as they are
             images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
         tokens = self.token(self.cut(images, self.patch))
-        keys, values, features = self.token_heads(tokens).split([16, 8, 32], -1)
+        keys, values, features = self.token_heads(tokens).split([KEY_DIM, 8, 32], -1)
         contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
         return keys, contents, keypoints.flatten(1), features.relu().amax(1)
 
@@ -299,19 +304,19 @@ class HistoryEncoder(nn.Module):
         self.image = ImageEncoder(config["image_shape"])
         self.register_buffer("joints_mean", torch.zeros(config["joints_dim"]))
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
-        self.code = nn.Linear(256, 16 + 16)
-        self.query = orthogonal_init(mlp([16, 64, 16]))
+        self.code = nn.Linear(256, MEMORY_DIM)
+        self.query = orthogonal_init(mlp([KEY_DIM, 64, KEY_DIM]))
         self.sure = nn.Linear(1, 1)  # of the attention's largest weight; at first half sure at 0.4
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
-        self.place = orthogonal_init(mlp([2 + 8 + 8 * 2, 64, 64]))
-        self.out = orthogonal_init(mlp([16 + 16 + 64, 256, 256]))
+        self.place = orthogonal_init(mlp([PLACE_DIM + 8 * 2, 64, 64]))
+        self.out = orthogonal_init(mlp([MEMORY_DIM + 64, 256, 256]))
         self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
         self.gru = nn.GRUCell(64 + 32, 256)
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory (..., 32), of which the first 16 ask -> place (..., 10), log weights of the patches (..., N)."""
-        place, log_weights = attend(self.query(memory[..., :16]).unsqueeze(-2), keys, contents)
+        """Memory (..., 32), of which the first KEY_DIM ask -> place (..., 10), log weights of the patches (..., N)."""
+        place, log_weights = attend(self.query(memory[..., :KEY_DIM]).unsqueeze(-2), keys, contents)
         return place.squeeze(-2), log_weights.squeeze(-2)
 
     def keep(self, place: Tensor, log_weights: Tensor, before: Tensor) -> Tensor:
@@ -342,8 +347,8 @@ class HistoryEncoder(nn.Module):
         The recurrent state is the GRU's and the place, (B, 256 + 10).
         """
         if recurrent is None:
-            recurrent = joints.new_zeros(len(rgb), 256 + 10)
-        memory, embedded, *after = self.step(*recurrent.split([256, 10], -1), *self.image(rgb))
+            recurrent = joints.new_zeros(len(rgb), 256 + PLACE_DIM)
+        memory, embedded, *after = self.step(*recurrent.split([256, PLACE_DIM], -1), *self.image(rgb))
         return self.combine(memory, embedded, joints), torch.cat(after, -1)
 
 

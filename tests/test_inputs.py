@@ -84,6 +84,16 @@ def test_physx_is_downloaded_by_one_process_at_a_time(monkeypatch: pytest.Monkey
     assert started
 
 
+@pytest.mark.parametrize("script", ["aib_belief", "ppo_believer"])
+@pytest.mark.parametrize(
+    "wrong, words", [(dict(batch_episodes=0), "--batch-episodes 0"), (dict(image_mask=1.0), "1.0")]
+)
+def test_no_episodes_or_no_pictures(capsys: pytest.CaptureFixture, script: str, wrong: dict, words: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        SCRIPTS[script].load_episodes(SCRIPTS[script].Args(**wrong))
+    refused((stop.value.code, *capsys.readouterr()), words, "--image-mask")
+
+
 def test_what_the_gpus_physics_cannot_draw(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     for module in (aib_repr, ppo_aib, ppo_believer, ppo_baseline):
         monkeypatch.setattr(module, "CUDA", True)
