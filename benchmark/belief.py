@@ -172,7 +172,7 @@ def main(args: Args) -> None:
         found["flow_loss"], found["flow_gain"] = flow_gain(model["head"], test["z_mean"], test["actions"])
     aib_belief.save(args.run / "diagnostics.json", json.dumps(found, indent=2).encode())
     beliefs = report.select(report.collect(Path("runs"))["beliefs.csv"], task=trained.env_id)
-    print(report.beliefs_table(beliefs, [(trained.env_id, setting) for setting in beliefs.setting.unique()]))
+    print(report.beliefs_table(beliefs))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
-import pandas as pd
 import pytest
 import tyro
 
@@ -56,7 +55,7 @@ def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     assert "| success_once | ppo_baseline, 3,000 steps | 0.13 | 0.30 |" in text
     assert "| success_once | published_ppo, 1,000 steps | 0.25 | 0.25 |" in text
     assert "| success_once | AIB, the paper's | 0.82 ± 0.04 | 0.87 ± 0.01 |" in text
-    assert "| AIB, no head | aib_belief | 1 |  |  | 0.90 | 0.50 | 0.25 | 0.50 | -3.00 | -4.00 |  |" in text
+    assert "| 0.25 | 0.25 | 0.25 | 0.25 |  |  | 0.90 | 0.50 | 0.50 | -3.00 | -4.00 |  |" in text
     assert "quick" not in text and "average" not in text
     record(tmp_path, "ppo_aib", 1, [0.4], task="InterceptFast-v0")
     report.main(report.Args(runs=tmp_path, output=tmp_path / "report"))
@@ -65,67 +64,42 @@ def test_report_against_numbers_computed_by_hand(tmp_path: Path) -> None:
     assert iio.imread(tmp_path / "report" / "learning_curves.png").std() > 10
 
 
-def test_six_seeds_have_a_bootstrap_interval() -> None:
-    assert report.summarise([0.1, 0.2, 0.3, 0.4, 0.5]) == "0.30 (0.10, 0.20, 0.30, 0.40, 0.50)"
-    text = report.summarise([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    assert text.startswith("0.35 ± 0.19 [")  # sample deviation 0.1871; the mean's standard error is near 0.070
-    low, high = text.split("[")[1].rstrip("]").split(", ")
-    assert 0.2 < float(low) < 0.25 and 0.45 < float(high) < 0.5
-
-
-def test_aib_and_believer_are_compared_at_equal_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "rows_of", lambda table: [(TASK, "small")] if table == "agents" else [])
-    rows = []
-    for method, seed, values in (("AIB", 1, [0.1, 0.3, 0.5, 0.7, 1.0]), ("Believer", 1, [0.2, 0.2, 0.2, 0.2])):
-        rows += [(method, seed, step, value) for step, value in enumerate(values, 1)]
-    rows += [("AIB", 2, 1, 0.5), ("Believer", 2, 1, 0.6), ("AIB", 3, 1, 0.9)]  # seed 3 has no partner
-    for seed in range(4, 8):
-        rows += [("AIB", seed, 1, 0.5), ("Believer", seed, 1, 0.5)]
-    evals = []
-    for method, seed, step, value in rows:
-        run = {"task": TASK, "method": method, "setting": "small", "seed": seed, "step": step}
-        evals.append({**run, "success_once": value, "success_at_end": value / 2})
-    tests = []
-    found = [("AIB", 1, 5, 0.9), ("Believer", 1, 4, 0.1), ("AIB", 2, 1, 0.4), ("Believer", 2, 1, 0.3)]
-    for method, seed, step, value in [*found, ("AIB", 4, 1, 0.5), ("Believer", 4, 1, 0.5)]:
-        run = {"task": TASK, "method": method, "setting": "small", "seed": seed, "step": step}
-        tests.append({**run, "success_once": value, "success_at_end": value / 2})
-    table = report.pairs_table(pd.DataFrame(evals), pd.DataFrame(tests)).splitlines()
-    # seed 1 at step 4: 0.3, 0.5, 0.7 against 0.2; without the end of the longer run, and without its test
-    task = "| RememberShapeAndColor3x2 | small"
-    assert table[2] == f"{task} | 1 | 4 | 0.50 | 0.20 | +0.30 | +0.15 |  |  |  |  |"
-    assert table[3] == f"{task} | 2 | 1 | 0.50 | 0.60 | -0.10 | -0.05 | 0.40 | 0.30 | +0.10 | +0.05 |"
-    means = ["+0.03 ± 0.14 [-0.05, +0.15], 6 pairs", "+0.02 ± 0.07 [-0.02, +0.07], 6 pairs"]
-    tested = ["+0.05 (+0.10, +0.00), 2 pairs", "+0.03 (+0.05, +0.00), 2 pairs"]
-    assert (
-        table[8]
-        == f"| mean, Remember tasks |  |  |  |  |  | {means[0]} | {means[1]} |  |  | {tested[0]} | {tested[1]} |"
-    )
-    assert table[9].startswith("| mean, Intercept tasks |") and len(table) == 10
-
-
-def test_runs_are_added_to_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    record(tmp_path, "ppo_aib_small", 3, [0.25, 0.5])
-    (tmp_path / f"{TASK}__ppo_aib_small__3" / "evaluation.json").write_text(
-        '{"global_step": 960, "success_once": 0.75}'
-    )
+def test_runs_are_added_to_the_results_and_tabled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = tmp_path / "runs"
+    for seed, shift in ((1, -0.2), (11, 0.0), (12, 0.1), (13, 0.2)):
+        record(runs, "ppo_aib_small", seed, [0.25, 0.5 + shift])
+        record(runs, "ppo_believer_small", seed, [0.25, 0.5])
+        for name, once in (("ppo_aib_small", 0.6 + shift), ("ppo_believer_small", 0.5)):
+            path = runs / f"{TASK}__{name}__{seed}"
+            test = {"global_step": 2000, "success_once": once, "success_at_end": once / 2, "num_eval_episodes": 256}
+            (path / "evaluation.json").write_text(json.dumps(test))
+    (path / "diagnosis.json").write_text('{"nearest_is_right": 0.75, "u_r2": {"0": 1.0, "5": 0.5}}')
+    (path / "diagnosis_swapped.json").write_text('{"success_once": 0.125}')
     monkeypatch.setattr(report, "RESULTS", tmp_path)
-    for name in ("eval.csv", "test.csv"):
-        (tmp_path / name).write_text(",".join(report.KEY + report.METRICS) + "\n")
-    (tmp_path / "beliefs.csv").write_text(",".join([*report.KEY, "metric", "value"]) + "\n")
-    head = "setting,aib_repr,aib_belief,ppo,steps_before_ppo,note\n"
-    (tmp_path / "settings.csv").write_text(head)
+    (tmp_path / "paper.csv").write_text((ROOT / "benchmark" / "results" / "paper.csv").read_text())
+    for name, columns in report.COLUMNS.items():
+        (tmp_path / name).write_text(",".join([*report.RUN, "step", *columns]) + "\n")
     with pytest.raises(SystemExit):
-        report.main(report.Args(runs=tmp_path, add="pink noise"))
-    assert report.read("eval.csv").empty
-    (tmp_path / "settings.csv").write_text(head + "pink noise,,,--noise-beta 1,,\n")
-    report.main(report.Args(runs=tmp_path, add="pink noise"))
-    report.main(report.Args(runs=tmp_path, add="pink noise"))  # a second time in place of the first
-    rows = (tmp_path / "eval.csv").read_text().splitlines()[1:]
-    assert rows == [
-        f"{TASK},AIB,pink noise,3,{x},," for x in ("1000,0.2500,0.1250,3.5000", "2000,0.5000,0.2500,3.5000")
-    ]
-    assert (tmp_path / "test.csv").read_text().splitlines()[1:] == [f"{TASK},AIB,pink noise,3,960,0.7500,,,,"]
+        report.main(report.Args(runs=runs, add=True))
+    for command in (["init", "-q"], ["-c", "user.name=x", "-c", "user.email=x", "commit", "-qm", "x", "--allow-empty"]):
+        subprocess.run(["git", "-C", str(tmp_path), *command], check=True)
+    report.main(report.Args(runs=runs, add=True))
+    report.main(report.Args(runs=runs, add=True))  # a second time in place of the first
+    commit = subprocess.run(["git", "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True, cwd=runs).stdout
+    tests, beliefs = (tmp_path / "test.csv").read_text().splitlines(), report.read("beliefs.csv")
+    run = f"{TASK},ppo_believer_small,13,{commit.strip()},"
+    assert len(tests) == 1 + 8 and tests[-1] == f"{run}2000,0.5000,0.2500,,0.7500,0.1250"
+    assert len(report.read("eval.csv")) == 16 and [*beliefs.metric] == ["u_r2_agent"] * 2
+    evals, tests = report.read("eval.csv"), report.read("test.csv")
+    # seed 1 is left out: 0.6, 0.7, 0.8 and 0.3, 0.35, 0.4; the paper's of RememberShapeAndColor3x2
+    cells = "0.70 ± 0.10 / 0.35 ± 0.05 | 0.50 ± 0.00 / 0.25 ± 0.00 |  |  | 11, 12, 13 | 0.82 / 0.81 |"
+    assert f"| RememberShapeAndColor3x2 | 0.17 | {cells}" in report.results_table(tests)
+    # differences 0.1, 0.2, 0.3: standard error 0.0577, t of two degrees of freedom 4.303
+    assert "| 3 | +0.20 [-0.05, +0.45] | +0.10 [-0.02, +0.22] |" in report.pairs_table(tests)
+    table = report.runs_table(evals, tests)
+    assert f"| Believer | 13 | {commit.strip()} | 2,000 | 0.38 | 0.19 | 0.50 | 0.25 | 0.75 | 0.12 |" in table
+    before = report.results_table(tests[tests.seed == 1])
+    assert "| 0.40 / 0.20 | 0.50 / 0.25 |  |  | 1 |" in before, "until a block is finished"
 
 
 def test_pages_and_figures_are_those_of_the_data(tmp_path: Path) -> None:
@@ -139,27 +113,11 @@ def test_pages_and_figures_are_those_of_the_data(tmp_path: Path) -> None:
         assert np.array_equal(made, kept), f"python benchmark/report.py changes {name}"
 
 
-def test_every_setting_of_the_results_is_explained() -> None:
-    settings = report.read("settings.csv")
-    files = ("eval.csv", "test.csv", "beliefs.csv", "nearest.csv")
-    assert {*settings.setting} == {setting for name in files for setting in report.read(name).setting}
-    for row in settings[settings.commit.isna()].fillna("").itertuples():  # the others: arguments of that commit
-        for script in ("aib_repr", "aib_belief"):
-            tyro.cli(SCRIPTS[script].Args, args=shlex.split(getattr(row, script)))
-        tyro.cli(SCRIPTS["ppo_aib"].Args, args=shlex.split(row.ppo))
-
-
-def test_every_result_is_in_a_table_or_quoted() -> None:
-    def runs(name: str) -> set[tuple[str, str]]:
-        return {(row.task, row.setting) for row in report.read(name).itertuples()}
-
-    named, files = runs("tables.csv"), ("eval.csv", "test.csv", "beliefs.csv", "nearest.csv")
-    assert all(runs(name) <= named for name in files)  # table "text": quoted in docs/results.md
-
-
-def test_rows_of_the_results_are_unique() -> None:
-    for name, key in (("eval.csv", report.KEY), ("test.csv", report.KEY), ("beliefs.csv", [*report.KEY, "metric"])):
-        assert not report.read(name).duplicated(key).any()
+def test_rows_of_the_results_are_unique_and_have_a_commit() -> None:
+    for name in report.COLUMNS:
+        rows = report.read(name)
+        key = [*report.RUN, "step", *(["metric"] if name == "beliefs.csv" else [])]
+        assert not rows.duplicated(key).any() and rows.commit.notna().all()
 
 
 def test_nothing_to_report(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
