@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import gymnasium as gym
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -114,6 +115,8 @@ def test_an_agent_plays_in_a_loop_of_ones_own(quick_runs: Path) -> None:
     agent = quick_runs / f"{TASK}__ppo_aib_quick__1" / "agent.pt"
     code, out, err = run("docs/examples/play_agent", "--checkpoint", str(agent), cwd=quick_runs.parent)
     assert code == 0 and f"{TASK}, seed 0: " in out, out + err
+    steps = gym.spec(TASK).max_episode_steps
+    assert len(iio.imread(quick_runs.parent / "episode.mp4")) == steps
 
 
 @pytest.mark.thorough

@@ -1,13 +1,15 @@
-"""Play an agent of ppo_aib.py in a loop of one's own.
+"""Play an agent of ppo_aib.py in a loop of one's own: by default the one beside this file.
 
-Usage:   python docs/examples/play_agent.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
-Prints:  whether the episode succeeded
+Usage:   python docs/examples/play_agent.py --seed 1
+         python docs/examples/play_agent.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
+Writes:  episode.mp4, what the agent's camera saw; prints whether the episode succeeded
 """
 
 import sys
 from pathlib import Path
 
 import gymnasium as gym
+import imageio.v3 as iio
 import torch
 import tyro
 
@@ -16,7 +18,7 @@ import ppo_aib
 
 
 @torch.no_grad()
-def main(checkpoint: Path, seed: int = 0) -> None:
+def main(checkpoint: Path = Path(__file__).with_name("remember_color9.pt"), seed: int = 0) -> None:
     """Play one episode with mean actions."""
     stored = torch.load(checkpoint, map_location="cpu", weights_only=True)
     same = {name: stored[name] for name in ("env_id", "image_size", "robot_triangles", "amp", "num_particles")}
@@ -25,15 +27,17 @@ def main(checkpoint: Path, seed: int = 0) -> None:
     agent = ppo_aib.Agent(envs, ppo_aib.AIBBelief(stored["config"]), args)
     agent.load_state_dict(stored["agent"])
     obs, _ = envs.reset(seed=[seed])
-    state, succeeded = None, False  # of the belief's memory
+    recurrent, succeeded, frames = None, False, []
     for _ in range(gym.spec(args.env_id).max_episode_steps):
         rgb, joints = torch.as_tensor(obs["rgb"]), torch.as_tensor(obs["joints"])
-        h, state = agent.belief.history(rgb, joints, state)
+        frames.append(obs["rgb"][0].repeat(6, 0).repeat(6, 1))  # enlarged
+        h, recurrent = agent.belief.history(rgb, joints, recurrent)
         p_u = agent.belief.decode(h, torch.randn(1, args.num_particles, agent.belief.config["z_dim"]))
         dist, _ = agent({"rgb": rgb, "joints": joints, "particles": p_u.sample()})
         obs, _, _, _, info = envs.step(dist.mean.numpy())
         succeeded |= bool(info["success"][0])
     envs.close()
+    iio.imwrite("episode.mp4", frames, fps=10)
     print(f"{args.env_id}, seed {seed}: {'a success' if succeeded else 'no success'}")
 
 
