@@ -16,9 +16,11 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import ppo_aib
 
+AGENT = Path(__file__).with_name("remember_color9.pt")
+
 
 @torch.no_grad()
-def main(checkpoint: Path = Path(__file__).with_name("remember_color9.pt"), seed: int = 0) -> None:
+def main(checkpoint: Path = AGENT, seed: int = 0) -> None:
     """Play one episode with mean actions."""
     stored = torch.load(checkpoint, map_location="cpu", weights_only=True)
     same = {name: stored[name] for name in ("env_id", "image_size", "robot_triangles", "amp", "num_particles")}
