@@ -19,12 +19,12 @@ run: setup
 
 demo: setup
 	task="--env-id RememberColor3-v0 --small"
-	echo "AIB on RememberColor3-v0 in three stages, an estimated 45 minutes on two cores; stopped, make demo resumes it"
-	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 3 minutes"
+	echo "AIB on RememberColor3-v0 in three stages, less than an hour; stopped, make demo resumes it"
+	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 6 minutes"
 	$(PY) aib_repr.py $$task --num-episodes 640 --exp-name aib_repr_demo
-	echo "stage 2 of 3: the belief, an estimated 25 minutes"
+	echo "stage 2 of 3: the belief, about 20 minutes"
 	$(PY) aib_belief.py $$task --repr-dir runs/RememberColor3-v0__aib_repr_demo__1 --exp-name aib_belief_demo
-	echo "stage 3 of 3: PPO on observation and belief, about 14 minutes; curves: .venv/bin/tensorboard --logdir runs"
+	echo "stage 3 of 3: PPO on observation and belief, about 30 minutes; curves: .venv/bin/tensorboard --logdir runs"
 	$(PY) ppo_aib.py $$task --belief runs/RememberColor3-v0__aib_belief_demo__1/belief.pt --exp-name ppo_aib_demo --total-timesteps 120000
 	$(PY) benchmark/report.py --runs runs
 	echo "chance level of success_once: 0.33; plain PPO stays there"

@@ -135,7 +135,8 @@ def select(rows: pd.DataFrame, **chosen: object) -> pd.DataFrame:
 
 
 def shown(rows: pd.DataFrame) -> pd.DataFrame:
-    """Of each task the reported seeds; before there are any, the newest commit's runs of those of the choices."""
+    """Of each task the runs of the comparison; before there are any, the newest commit's of those of the choices."""
+    rows = rows[rows.exp_name.isin(LABELS)]
     parts = [rows[:0]]
     for _, found in rows.groupby("task", sort=False):
         reported = found[found.seed >= FIRST_REPORTED_SEED]
