@@ -224,26 +224,56 @@ def runs_table(evals: pd.DataFrame, tests: pd.DataFrame) -> str:
     return markdown(rows)
 
 
+def blocks_of(tests: pd.DataFrame, exp_name: str, metric: str) -> dict[str, pd.Series]:
+    """By task: a metric of the comparison's blocks, by seed."""
+    rows = select(tests[tests.seed >= FIRST_REPORTED_SEED], exp_name=exp_name).set_index("seed")
+    return {task: rows[rows.task == task][metric] for task in TASKS if task in {*rows.task}}
+
+
 def pairs_table(tests: pd.DataFrame) -> str:
-    """AIB - Believer on test episodes by task, over the blocks that have both: mean [95 % t interval]."""
-    rows = []
-    for task in TASKS:
-        row = {"task": name_of(task)}
-        for metric in METRICS:
-            of_seed = select(tests[tests.seed >= FIRST_REPORTED_SEED], task=task).pivot(
-                index="seed", columns="exp_name", values=metric
-            )
-            if not {"ppo_aib_small", "ppo_believer_small"} <= {*of_seed}:
-                continue
-            difference = (of_seed["ppo_aib_small"] - of_seed["ppo_believer_small"]).dropna()
-            row["pairs"] = len(difference)
+    """AIB - Believer on test episodes over the blocks that have both: mean [95 % interval].
+
+    The interval of a task is Student's t's; over tasks a bootstrap's, with blocks drawn anew within each task.
+    """
+    rows, rng = {}, np.random.default_rng(0)
+    for metric in METRICS:
+        aib, believer = (blocks_of(tests, name, metric) for name in ("ppo_aib_small", "ppo_believer_small"))
+        pairs = {task: (aib[task] - believer[task]).dropna() for task in aib if task in believer}
+        for task, difference in pairs.items():
+            row = rows.setdefault(task, {"task": name_of(task), "pairs": len(difference)})
             row[metric] = f"{difference.mean():+z.2f}"
             if len(difference) > 1:
                 low, high = scipy.stats.ttest_1samp(difference, 0).confidence_interval()
                 row[metric] += f" [{low:+.2f}, {high:+.2f}]"
-        if "pairs" in row:
+        if len(pairs) > 1:
+            row = rows.setdefault("all", {"task": "mean over tasks", "pairs": sum(map(len, pairs.values()))})
+            drawn = [rng.choice(difference, (10_000, len(difference))).mean(1) for difference in pairs.values()]
+            low, high = np.quantile(np.mean(drawn, axis=0), [0.025, 0.975])
+            row[metric] = f"{np.mean([x.mean() for x in pairs.values()]):+z.2f} [{low:+.2f}, {high:+.2f}]"
+    return markdown([*rows.values()] or [{"task": "no block has both methods yet"}])
+
+
+def plain_table(tests: pd.DataFrame) -> str:
+    """A belief - plain PPO of as many steps in all: mean over tasks; p of labels permuted within each task."""
+    rows, rng = [], np.random.default_rng(0)
+    for name in ("ppo_aib_small", "ppo_believer_small"):
+        row = {"method": LABELS[name]}
+        for metric in METRICS:
+            belief, plain = blocks_of(tests, name, metric), blocks_of(tests, "ppo_baseline_equal", metric)
+            tasks = [task for task in belief if task in plain]
+            observed, permuted = [], []
+            for task in tasks:
+                count, pooled = len(belief[task]), np.concatenate([belief[task], plain[task]])
+                drawn = np.vstack([pooled, rng.permuted(np.tile(pooled, (10_000, 1)), axis=1)])
+                difference = drawn[:, :count].mean(1) - drawn[:, count:].mean(1)
+                observed.append(difference[0])
+                permuted.append(difference)
+            if tasks:
+                p = (np.mean(permuted, axis=0) >= np.mean(observed) - 1e-9).mean()
+                row |= {"tasks": len(tasks), metric: f"{np.mean(observed):+z.2f}, p = {p:.4f}"}
+        if "tasks" in row:
             rows.append(row)
-    return markdown(rows or [{"task": "no block has both methods yet"}])
+    return markdown(rows or [{"method": "no block has both methods yet"}])
 
 
 def beliefs_table(beliefs: pd.DataFrame) -> str:
@@ -359,7 +389,7 @@ def rebuild(output: Path) -> None:
     """README.md, docs/results.md and their figures, below output."""
     evals, tests, beliefs = read("eval.csv"), read("test.csv"), read("beliefs.csv")
     tables = {"results": results_table(tests), "runs": runs_table(evals, tests)}
-    tables |= {"pairs": pairs_table(tests), "beliefs": beliefs_table(beliefs)}
+    tables |= {"pairs": pairs_table(tests), "plain": plain_table(tests), "beliefs": beliefs_table(beliefs)}
     for page in ("README.md", "docs/results.md"):
         text = (ROOT / page).read_text()
         for name, table in tables.items():

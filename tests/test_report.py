@@ -1,6 +1,7 @@
 """The benchmark's commands and its report, on numbers one can check by hand, and the pages that it makes."""
 
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+import pandas as pd
 import pytest
 import tyro
 
@@ -96,6 +98,17 @@ def test_runs_are_added_to_the_results_and_tabled(tmp_path: Path, monkeypatch: p
     assert f"| RememberShapeAndColor3x2 | 0.17 | {cells}" in report.results_table(tests)
     # differences 0.1, 0.2, 0.3: standard error 0.0577, t of two degrees of freedom 4.303
     assert "| 3 | +0.20 [-0.05, +0.45] | +0.10 [-0.02, +0.22] |" in report.pairs_table(tests)
+    equal = tests[tests.exp_name == "ppo_believer_small"].assign(exp_name="ppo_baseline_equal")
+    # of the 20 ways to label 0.6, 0.7, 0.8 and 0.5 three times, one has a difference as large as 0.2
+    plain = report.plain_table(pd.concat([tests, equal]))
+    p = float(re.search(r"\| AIB \| 1 \| \+0.20, p = ([0-9.]+) \|", plain).group(1))
+    assert p == pytest.approx(1 / 20, abs=0.01)
+    both = pd.concat([tests, tests.assign(task="InterceptFast-v0")])
+    # the mean of two means of 0.1, 0.2, 0.3: 95 % of the bootstrap's lie within 0.2 +- 1.96 * sqrt(0.02 / 3 / 3 / 2)
+    low, high = re.search(
+        r"\| mean over tasks \| 6 \| \+0.20 \[\+([0-9.]+), \+([0-9.]+)\]", report.pairs_table(both)
+    ).groups()
+    assert float(low) == pytest.approx(0.135, abs=0.02) and float(high) == pytest.approx(0.265, abs=0.02)
     table = report.runs_table(evals, tests)
     assert f"| Believer | 13 | {commit.strip()} | 2,000 | 0.38 | 0.19 | 0.50 | 0.25 | 0.75 | 0.12 |" in table
     before = report.results_table(tests[tests.seed == 1])
