@@ -117,8 +117,6 @@ class Args:
     """whole episodes per iteration, each of the task's length; on physx_cuda they begin with one arm pose"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
-    cnn_lr_scale: float = 1.0
-    """the policy's image network learns at this multiple of --learning-rate"""
     update_epochs: int = 2
     """passes over an iteration's data"""
     num_minibatches: int = 32
@@ -170,7 +168,6 @@ SMALL = dict(
     num_envs=16,
     num_minibatches=8,
     update_epochs=8,
-    cnn_lr_scale=0.1,
     target_kl=0.1,
     init_std=0.3,
     noise_beta=0.7,
@@ -919,11 +916,7 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     agent = Agent(envs, BelieverBelief(stored["config"]), args).to(args.device)
     agent.belief.load_state_dict(stored["belief"])
-    rest_params = [
-        x for name, x in agent.named_parameters() if not name.startswith("cnn.")
-    ]  # the belief's get no gradient
-    cnn = {"params": agent.cnn.parameters(), "lr": args.cnn_lr_scale * args.learning_rate}
-    optimizer = torch.optim.Adam([cnn, {"params": rest_params}], lr=args.learning_rate, eps=1e-5, fused=True)
+    optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     completed, evals = checkpoint.get("iteration", 0), checkpoint.get("evals", [])
     reward_var = checkpoint.get("reward_var", 0.0)
     if checkpoint:
