@@ -377,12 +377,12 @@ class Agent(nn.Module):
         spaces = envs.single_observation_space
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False).eval()  # frozen; W_enc and W_agg learn with actor and critic
-        self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
+        self.cnn = NatureCNN(spaces["rgb"].shape, 256, args.amp)
         # running mean and std of the joints; not updated without --joints-norm
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
-        self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
-        self.w_enc = orthogonal_init(mlp([belief.config["u_dim"], 64, 64]))
-        self.w_agg = orthogonal_init(mlp([64, 64, 64]))
+        self.joints = nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU())
+        self.w_enc = mlp([belief.config["u_dim"], 64, 64])
+        self.w_agg = mlp([64, 64, 64])
         self.actor = orthogonal_init(mlp([256 + 128 + 64, 512, action_dim]))
         self.critic = orthogonal_init(mlp([256 + 128 + 64, 512, 1]))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)

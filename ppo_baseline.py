@@ -196,10 +196,10 @@ class Agent(nn.Module):
         super().__init__()
         spaces = envs.single_observation_space
         (action_dim,) = envs.single_action_space.shape
-        self.cnn = orthogonal_init(NatureCNN(spaces["rgb"].shape, 256, args.amp))
+        self.cnn = NatureCNN(spaces["rgb"].shape, 256, args.amp)
         # running mean and std of the joints; not updated without --joints-norm
         self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
-        self.joints = orthogonal_init(nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU()))
+        self.joints = nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU())
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
         self.critic = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, 1)))
         orthogonal_init(self.actor[-1], 0.01 * 2**0.5)

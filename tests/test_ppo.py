@@ -429,7 +429,7 @@ def test_pictures_of_any_size_make_a_video(size: int) -> None:
 
 def test_orthogonal_initialisation() -> None:
     agent = ppo_baseline.Agent(toy.ToyMemory(1), ppo_baseline.Args())
-    for layer, gain in ((agent.joints[0], 2**0.5), (agent.actor[2], 0.01 * 2**0.5), (agent.critic[2], 2**0.5)):
+    for layer, gain in ((agent.actor[0], 2**0.5), (agent.actor[2], 0.01 * 2**0.5), (agent.critic[2], 2**0.5)):
         gram = layer.weight @ layer.weight.T if layer.weight.shape[0] <= layer.weight.shape[1] else None
         gram = layer.weight.T @ layer.weight if gram is None else gram
         assert torch.allclose(gram, gain**2 * torch.eye(len(gram)), atol=1e-4) and (layer.bias == 0).all()
