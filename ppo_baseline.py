@@ -141,7 +141,6 @@ SMALL = dict(
     reward_norm=True,
     joints_norm=True,
     image_size=64,
-    eval_every=15,
     num_eval_episodes=64,
     amp=BFLOAT16,
 )
