@@ -28,6 +28,7 @@ def main(checkpoint: Path = AGENT, seed: int = 0) -> None:
     envs = ppo_aib.make_envs(args)
     agent = ppo_aib.Agent(envs, ppo_aib.AIBBelief(stored["config"]), args)
     agent.load_state_dict(stored["agent"])
+    torch.manual_seed(seed)  # of the particles
     obs, _ = envs.reset(seed=[seed])
     recurrent, succeeded, frames = None, False, []
     for _ in range(gym.spec(args.env_id).max_episode_steps):
