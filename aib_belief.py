@@ -33,7 +33,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 CUDA = torch.cuda.is_available()
-VAL_EVERY = 250  # updates of the belief between checkpoints, each with a validation
+VAL_EVERY = 250  # updates of the belief between checkpoints; after the warm-up each comes with a validation
 IMAGE_CHUNK = 4096 if CUDA else 64  # images through the history encoder at a time: what a CPU's cache holds
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
@@ -75,11 +75,11 @@ class Args:
     fm_latent: Literal["mean", "sample"] = "mean"
     """z in L_FM: the mean of q; or a sample of q, which is the paper's choice and mostly noise at first"""
     image_mask: float = 0.25
-    """share of all blocks of 2 x 2 pixels that are hidden while the belief is trained, against overfitting"""
+    """share of the blocks of 2 x 2 pixels that training hides, against overfitting; 0: as in the paper"""
     occlusion: float = 0.5
     """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
     warmup_updates: int = 0
-    """updates on single frames before those, where a teacher that knows u_0 asks for the memory; 0: as in the paper"""
+    """updates on single frames before --num-updates; a teacher that knows the first u is the memory; 0: as the paper"""
     prior_nll: float = 0.0
     """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
 
@@ -184,16 +184,16 @@ class ImageEncoder(nn.Module):
     def forward(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
 
-        Contents are coordinates and values; the summary is (B, 32). mask: share of the blocks of 2 x 2 pixels that are
-        replaced by the mean for all but the keypoints.
+        Contents are coordinates and values; the summary is (B, 32). mask, in training: share of the blocks of 2 x 2
+        pixels that are replaced by the mean for all but the keypoints.
         """
         images = rgb.float().sub_(self.mean).div_(self.std)
         keypoints, _ = attend(self.point_queries, self.point(self.cut(images, self.block)), self.block_coordinates)
         if mask:
-            batch, height, width = rgb.shape[0], rgb.shape[1] // 2, rgb.shape[2] // 2  # in blocks
-            kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
-            images = images.clone()  # the keypoints' stay as they are
-            images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
+            batch, height, width, _ = rgb.shape
+            kept = torch.rand(batch, (height + 1) // 2, (width + 1) // 2, device=rgb.device) >= mask
+            kept = kept.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, :height, :width]
+            images = images * kept.unsqueeze(-1)
         tokens = self.token(self.cut(images, self.patch))
         keys, values, features = self.token_heads(tokens).split([KEY_DIM, 8, 32], -1)
         contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
@@ -213,7 +213,7 @@ class HistoryEncoder(nn.Module):
     2. A query made of that half attends to the patches of o_t, which gives a place: coordinates and values. Where the
        attention is not sure, as the arm hides the object, the place stays the one of the step before.
     3. h_t = MLP(memory, place, keypoints) + linear(joints). The GRU then gets place, keypoints and summary of o_t.
-    Past actions (E.2) are not in the history: the action head reads a_t off the joints at t and t + 1.
+    Past actions (E.2) are not in the history: the joints at t and t + 1 show a_t anyway.
     """
 
     def __init__(self, config: dict):
@@ -223,12 +223,14 @@ class HistoryEncoder(nn.Module):
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
         self.code = nn.Linear(256, MEMORY_DIM)
         self.query = orthogonal_init(mlp([KEY_DIM, 64, KEY_DIM]))
-        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; at first half sure at 0.4
+        self.sure = nn.Linear(1, 1)  # of the attention's largest weight w; at first sigmoid(10 w - 4)
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
         self.place = orthogonal_init(mlp([PLACE_DIM + 8 * 2, 64, 64]))
         self.out = orthogonal_init(mlp([MEMORY_DIM + 64, 256, 256]))
-        self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
+        self.arm = nn.Linear(config["joints_dim"], 256)
+        nn.init.zeros_(self.arm.weight)  # joints identify an episode: let the rest learn first
+        nn.init.zeros_(self.arm.bias)
         self.gru = nn.GRUCell(64 + 32, 256)
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
@@ -309,9 +311,9 @@ def encode_history(history: nn.Module, batch: dict[str, Tensor], mask: float = 0
     hidden, place = batch["joints"].new_zeros(num_episodes, 256), batch["joints"].new_zeros(num_episodes, PLACE_DIM)
     memories, embedded = [], []
     for t in range(num_steps):
-        memory, places, hidden, place = history.step(hidden, place, *(x[t] for x in seen))
+        memory, found, hidden, place = history.step(hidden, place, *(x[t] for x in seen))
         memories.append(memory)
-        embedded.append(places)
+        embedded.append(found)
     memory = torch.stack(memories)
     return history.combine(memory, torch.stack(embedded), batch["joints"]), memory
 
@@ -364,13 +366,13 @@ def belief_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
         losses["total"] = losses["total"] + args.prior_nll * losses["prior_nll"]
     if args.warmup_updates:
         losses["memory"] = memory_loss(model["teacher"], batch["u"], memory)
-        losses["total"] = losses["total"] + 10 * losses["memory"]
+        losses["total"] = losses["total"] + 10 * losses["memory"]  # 10: of the order of the other terms
     return losses
 
 
 # ---------------------------------------------------------------- warm-up
 # not in the paper, and off unless --warmup-updates or --prior-nll is given, as by --small: how attention learns to find
-# objects, and what else trains the belief then
+# objects, and the losses that come with it
 
 
 class Teacher(nn.Module):
@@ -409,13 +411,13 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
     belief, history, u = model["belief"], model["belief"].history, batch["u"]
     keys, contents, keypoints, _ = history.image(batch["rgb"], args.image_mask)
     memory = model["teacher"](batch["u_0"], batch["t"])
-    memory = torch.cat([memory, torch.zeros_like(memory)], -1)
+    memory = nn.functional.pad(memory, (0, MEMORY_DIM - KEY_DIM))  # the half that does not ask is empty
     place, log_weights = history.ask(memory, keys, contents)
     losses = {"error": 0.0}
     # the teacher's memory tells much of u: without passes that lack it the attention would not learn to look
     for use_memory, use_place, use_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
-        places = history.place(torch.cat([use_place * place, use_keypoints * keypoints], -1))
-        h = history.combine(use_memory * memory, places, history.joints_mean)  # joints would identify an episode
+        embedded = history.place(torch.cat([use_place * place, use_keypoints * keypoints], -1))
+        h = history.combine(use_memory * memory, embedded, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
         losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
     located = model["locator"](contents)
@@ -443,7 +445,7 @@ def hide_objects(model: nn.ModuleDict, batch: dict[str, Tensor], share: float, r
     keys, contents, *_ = history.image(rgb[t, episodes])
     place, _ = history.ask(memory, keys, contents)
     size = np.array(rgb.shape[2:4])
-    centres = (place[:, :2].cpu().numpy() + 1) / 2 * size
+    centres = (place[:, :2].cpu().numpy() + 1) / 2 * size  # in pixels, within half a patch
     for step, episode, centre in zip(t, episodes, centres, strict=True):
         half = rng.integers(size // 8, size // 4)
         top, left = (centre - half).clip(0).astype(int)
@@ -548,11 +550,11 @@ def main(args: Args) -> None:
     episodes, stored = load_episodes(args, env_id=args.env_id)
     num_val = stored["num_val"]
     train, held_out = np.split(np.arange(len(episodes)), [-num_val])
-    sample = episodes(train[:1])
-    action_dim = sample["actions"].shape[-1]
+    example = episodes(train[:1])
+    action_dim = example["actions"].shape[-1]
     config = {
-        "image_shape": list(sample["rgb"].shape[2:]),
-        "joints_dim": sample["joints"].shape[-1],
+        "image_shape": list(example["rgb"].shape[2:]),
+        "joints_dim": example["joints"].shape[-1],
         "u_dim": stored["u_dim"],
         "z_dim": args.z_dim,
     }
@@ -566,7 +568,7 @@ def main(args: Args) -> None:
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
         model["head"] = mlp([inputs, 256, action_dim])
     history = model["belief"].history
-    chrono_init(history.gru, len(sample["actions"]))
+    chrono_init(history.gru, len(example["actions"]))
     history.image.mean, history.image.std = stored["norm"]["image_mean"], stored["norm"]["image_std"]
     history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
     model.to(args.device)
@@ -592,13 +594,13 @@ def main(args: Args) -> None:
             progress = (update - args.warmup_updates - 1) / args.num_updates
         # falls to 0 over the second half of each phase, which lowers the error of the last weights
         optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - progress))
-        if args.warmup_updates:  # after it what finds and asks stays as it is, which makes an update twice as fast
+        if args.warmup_updates:  # after it image encoder and teacher stay as they are: updates are twice as fast
             history.image.requires_grad_(warming_up)
             model["teacher"].train(warming_up)
         if warming_up:
             episode = rng.choice(train, 8 * args.batch_episodes)
             # early steps more often (density t^(-1/3)), as they show what is to be remembered
-            t = (len(sample["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
+            t = (len(example["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
             frames = episodes.frames(episode, t)
             losses = warmup_losses(model, frames, args)
         else:
@@ -616,7 +618,7 @@ def main(args: Args) -> None:
                 writer.add_scalar(f"{'warmup' if warming_up else 'belief'}/{name}", value, update)
 
         if update % VAL_EVERY == 0 or update == num_updates:
-            if not warming_up:  # which trains no memory
+            if not warming_up:  # a warm-up trains no memory
                 u, estimate = validate_belief(model["belief"], episodes, held_out)
                 error = (u - estimate).square().sum(-1).mean().item()
                 writer.add_scalar("belief/held_out_error", error, update)
@@ -629,7 +631,7 @@ def main(args: Args) -> None:
     for t in range(len(u)):
         writer.add_scalar("belief/held_out_u_r2_by_step", r_squared(u[t], estimate[t]), t)
     writer.close()
-    # the last weights, not the best on held-out episodes: those are from before the cue can be read from h
+    # the last weights: the error on held-out episodes is lowest before h has learnt the cue
     content = {**asdict(args), "config": config}
     content |= {name: stored[name] for name in ("robot_triangles", "image_size")}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
@@ -656,7 +658,7 @@ def parse_args() -> Args:
     if "/" in args.exp_name:
         fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        if isinstance(value, int | float) and not value >= 0:
+        if isinstance(value, int | float) and not value >= 0:  # NaN, too
             fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
@@ -673,7 +675,7 @@ def open_run(args: Args) -> Path:
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     given, changed = asdict(args), []
-    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # more than its arguments
         for name, value in json.loads((path / "args.json").read_text()).items():
             if name in given and name not in MAY_DIFFER and value != given[name]:
                 changed.append(f"{name}={value} there, {given[name]} here")

@@ -527,7 +527,7 @@ def check_task(args: Args) -> None:
     if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
         fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
     if args.sim_backend == "physx_cuda" and args.robot_triangles:
-        fail(f"--sim-backend physx_cuda draws meshes as they are; --robot-triangles {args.robot_triangles} must be 0")
+        fail(f"physx_cuda needs --robot-triangles 0, not {args.robot_triangles}; physx_cpu is the other --sim-backend")
     if args.image_size < 36:
         fail(f"--image-size {args.image_size} must be at least 36, for the image network")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
@@ -567,7 +567,7 @@ def parse_args() -> Args:
     if "/" in args.exp_name:
         fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        if isinstance(value, int | float) and not value >= 0:
+        if isinstance(value, int | float) and not value >= 0:  # NaN, too
             fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
@@ -584,7 +584,7 @@ def open_run(args: Args) -> Path:
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     given, changed = asdict(args), []
-    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # more than its arguments
         for name, value in json.loads((path / "args.json").read_text()).items():
             if name in given and name not in MAY_DIFFER and value != given[name]:
                 changed.append(f"{name}={value} there, {given[name]} here")

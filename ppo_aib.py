@@ -139,7 +139,7 @@ MAY_DIFFER = ("num_workers", "total_timesteps", "checkpoint")  # when a run is r
 TASKS = {  # other tasks use the defaults, which are Table 5's for Intercept
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
-    "RememberColor5-v0": dict(gamma=0.95),  # not in Table 5: as RememberColor9
+    "RememberColor5-v0": dict(gamma=0.95),  # not in Table 5: the discount of RememberColor9
     "RememberColor3-v0": dict(gamma=0.95),
 }
 SMALL = dict(
@@ -167,7 +167,7 @@ QUICK = dict(
 
 
 # ---------------------------------------------------------------- networks
-# copied unchanged from aib_belief.py, but for Agent
+# copied unchanged from aib_belief.py, but for NatureCNN, which is in aib_repr.py, and Agent
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:
@@ -263,16 +263,16 @@ class ImageEncoder(nn.Module):
     def forward(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
 
-        Contents are coordinates and values; the summary is (B, 32). mask: share of the blocks of 2 x 2 pixels that are
-        replaced by the mean for all but the keypoints.
+        Contents are coordinates and values; the summary is (B, 32). mask, in training: share of the blocks of 2 x 2
+        pixels that are replaced by the mean for all but the keypoints.
         """
         images = rgb.float().sub_(self.mean).div_(self.std)
         keypoints, _ = attend(self.point_queries, self.point(self.cut(images, self.block)), self.block_coordinates)
         if mask:
-            batch, height, width = rgb.shape[0], rgb.shape[1] // 2, rgb.shape[2] // 2  # in blocks
-            kept = torch.rand(batch, height, 1, width, 1, 1, device=rgb.device) >= mask
-            images = images.clone()  # the keypoints' stay as they are
-            images[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2)).mul_(kept)
+            batch, height, width, _ = rgb.shape
+            kept = torch.rand(batch, (height + 1) // 2, (width + 1) // 2, device=rgb.device) >= mask
+            kept = kept.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, :height, :width]
+            images = images * kept.unsqueeze(-1)
         tokens = self.token(self.cut(images, self.patch))
         keys, values, features = self.token_heads(tokens).split([KEY_DIM, 8, 32], -1)
         contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
@@ -292,7 +292,7 @@ class HistoryEncoder(nn.Module):
     2. A query made of that half attends to the patches of o_t, which gives a place: coordinates and values. Where the
        attention is not sure, as the arm hides the object, the place stays the one of the step before.
     3. h_t = MLP(memory, place, keypoints) + linear(joints). The GRU then gets place, keypoints and summary of o_t.
-    Past actions (E.2) are not in the history: the action head reads a_t off the joints at t and t + 1.
+    Past actions (E.2) are not in the history: the joints at t and t + 1 show a_t anyway.
     """
 
     def __init__(self, config: dict):
@@ -302,12 +302,14 @@ class HistoryEncoder(nn.Module):
         self.register_buffer("joints_std", torch.ones(config["joints_dim"]))
         self.code = nn.Linear(256, MEMORY_DIM)
         self.query = orthogonal_init(mlp([KEY_DIM, 64, KEY_DIM]))
-        self.sure = nn.Linear(1, 1)  # of the attention's largest weight; at first half sure at 0.4
+        self.sure = nn.Linear(1, 1)  # of the attention's largest weight w; at first sigmoid(10 w - 4)
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
         self.place = orthogonal_init(mlp([PLACE_DIM + 8 * 2, 64, 64]))
         self.out = orthogonal_init(mlp([MEMORY_DIM + 64, 256, 256]))
-        self.arm = orthogonal_init(nn.Linear(config["joints_dim"], 256), 0.0)
+        self.arm = nn.Linear(config["joints_dim"], 256)
+        nn.init.zeros_(self.arm.weight)  # joints identify an episode: let the rest learn first
+        nn.init.zeros_(self.arm.bias)
         self.gru = nn.GRUCell(64 + 32, 256)
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
@@ -384,7 +386,7 @@ class Agent(nn.Module):
         self.w_agg = mlp([64, 64, 64])
         self.actor = orthogonal_init(mlp([256 + 128 + 64, 512, action_dim]))
         self.critic = orthogonal_init(mlp([256 + 128 + 64, 512, 1]))
-        orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
+        orthogonal_init(self.actor[-1], 0.01 * 2**0.5)  # gains as in ManiSkill's PPO
         self.log_std = nn.Parameter(torch.full((action_dim,), math.log(args.init_std)))
 
     def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
@@ -418,6 +420,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
     log_ratio = dist.log_prob(batch["actions"]).sum(-1) - batch["logprobs"]
     ratio = log_ratio.exp()
     advantages = batch["advantages"]
+    # correction=0: a minibatch may have a single step
     advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
     clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
@@ -429,7 +432,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
         "entropy": entropy,
         "total": policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss,
         "approx_kl": (ratio - 1 - log_ratio).mean(),  # Schulman's low-variance estimate
-        "clipfrac": (ratio != clipped).float().mean(),
+        "clipfrac": ((ratio - 1).abs() > args.clip_coef).float().mean(),
     }
 
 
@@ -490,7 +493,7 @@ def rollout(
             if t == steps:
                 break  # the last observation is only for its value
             actions = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            # before clamping; PPO ignores that coloured noise is correlated in time
+            # of the action before clamping, as if noise were white: PPO ignores its correlation in time
             transition |= {"actions": actions, "logprobs": dist.log_prob(actions).sum(-1)}
             controls = actions.clamp(-1, 1)
             if args.sim_backend == "physx_cpu":
@@ -574,6 +577,8 @@ def main(args: Args) -> None:
     check_task(args)
     batch_size = gym.spec(args.env_id).max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // batch_size)
+    if min(args.num_envs, args.num_minibatches, args.update_epochs, args.eval_every, args.num_eval_episodes) < 1:
+        fail("--num-envs, --num-minibatches, --update-epochs, --eval-every and --num-eval-episodes must be at least 1")
     if args.num_minibatches > batch_size:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {batch_size} steps of an iteration")
     if max(args.gamma, args.gae_lambda) > 1:
@@ -798,7 +803,7 @@ def check_task(args: Args) -> None:
     if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
         fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
     if args.sim_backend == "physx_cuda" and args.robot_triangles:
-        fail(f"--sim-backend physx_cuda draws meshes as they are; --robot-triangles {args.robot_triangles} must be 0")
+        fail(f"physx_cuda needs --robot-triangles 0, not {args.robot_triangles}; physx_cpu is the other --sim-backend")
     if args.image_size < 36:
         fail(f"--image-size {args.image_size} must be at least 36, for the image network")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
@@ -838,7 +843,7 @@ def parse_args() -> Args:
     if "/" in args.exp_name:
         fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        if isinstance(value, int | float) and not value >= 0:
+        if isinstance(value, int | float) and not value >= 0:  # NaN, too
             fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
@@ -855,7 +860,7 @@ def open_run(args: Args) -> Path:
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     given, changed = asdict(args), []
-    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # more than its arguments
         for name, value in json.loads((path / "args.json").read_text()).items():
             if name in given and name not in MAY_DIFFER and value != given[name]:
                 changed.append(f"{name}={value} there, {given[name]} here")

@@ -126,7 +126,7 @@ MAY_DIFFER = ("num_workers", "total_timesteps", "checkpoint")  # when a run is r
 TASKS = {  # other tasks use the defaults, which are Table 5's for Intercept
     "RememberShapeAndColor3x2-v0": dict(total_timesteps=10_380_000, num_envs=200, update_epochs=4, gamma=0.95),
     "RememberColor9-v0": dict(total_timesteps=10_380_000, num_envs=200, gamma=0.95),
-    "RememberColor5-v0": dict(gamma=0.95),  # not in Table 5: as RememberColor9
+    "RememberColor5-v0": dict(gamma=0.95),  # not in Table 5: the discount of RememberColor9
     "RememberColor3-v0": dict(gamma=0.95),
 }
 SMALL = dict(
@@ -201,7 +201,7 @@ class Agent(nn.Module):
         self.joints = nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU())
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
         self.critic = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, 1)))
-        orthogonal_init(self.actor[-1], 0.01 * 2**0.5)
+        orthogonal_init(self.actor[-1], 0.01 * 2**0.5)  # gains as in ManiSkill's PPO
         self.log_std = nn.Parameter(torch.full((action_dim,), math.log(args.init_std)))
 
     def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
@@ -234,6 +234,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
     log_ratio = dist.log_prob(batch["actions"]).sum(-1) - batch["logprobs"]
     ratio = log_ratio.exp()
     advantages = batch["advantages"]
+    # correction=0: a minibatch may have a single step
     advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
     clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
     policy_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
@@ -245,7 +246,7 @@ def ppo_losses(agent: nn.Module, batch: dict[str, Tensor], args: Args) -> dict[s
         "entropy": entropy,
         "total": policy_loss - args.ent_coef * entropy + args.vf_coef * value_loss,
         "approx_kl": (ratio - 1 - log_ratio).mean(),  # Schulman's low-variance estimate
-        "clipfrac": (ratio != clipped).float().mean(),
+        "clipfrac": ((ratio - 1).abs() > args.clip_coef).float().mean(),
     }
 
 
@@ -297,7 +298,7 @@ def rollout(
             if t == steps:
                 break  # the last observation is only for its value
             actions = dist.mean if deterministic else dist.mean + dist.stddev * noise[t, rows]
-            # before clamping; PPO ignores that coloured noise is correlated in time
+            # of the action before clamping, as if noise were white: PPO ignores its correlation in time
             transition |= {"actions": actions, "logprobs": dist.log_prob(actions).sum(-1)}
             controls = actions.clamp(-1, 1)
             if args.sim_backend == "physx_cpu":
@@ -369,6 +370,8 @@ def main(args: Args) -> None:
     check_task(args)
     batch_size = gym.spec(args.env_id).max_episode_steps * args.num_envs
     num_iterations = max(1, args.total_timesteps // batch_size)
+    if min(args.num_envs, args.num_minibatches, args.update_epochs, args.eval_every, args.num_eval_episodes) < 1:
+        fail("--num-envs, --num-minibatches, --update-epochs, --eval-every and --num-eval-episodes must be at least 1")
     if args.num_minibatches > batch_size:
         fail(f"--num-minibatches {args.num_minibatches} must be at most the {batch_size} steps of an iteration")
     if max(args.gamma, args.gae_lambda) > 1:
@@ -589,7 +592,7 @@ def check_task(args: Args) -> None:
     if (args.sim_backend, args.render_backend) == ("physx_cuda", "sapien_cpu"):
         fail("--sim-backend physx_cuda needs --render-backend sapien_cuda")
     if args.sim_backend == "physx_cuda" and args.robot_triangles:
-        fail(f"--sim-backend physx_cuda draws meshes as they are; --robot-triangles {args.robot_triangles} must be 0")
+        fail(f"physx_cuda needs --robot-triangles 0, not {args.robot_triangles}; physx_cpu is the other --sim-backend")
     if args.image_size < 36:
         fail(f"--image-size {args.image_size} must be at least 36, for the image network")
     tasks = {name: spec for name, spec in registration.REGISTERED_ENVS.items() if "mikasa" in spec.cls.__module__}
@@ -629,7 +632,7 @@ def parse_args() -> Args:
     if "/" in args.exp_name:
         fail(f"--exp-name {args.exp_name} must be a folder's name, without /")
     for name, value in asdict(args).items():
-        if isinstance(value, int | float) and not value >= 0:
+        if isinstance(value, int | float) and not value >= 0:  # NaN, too
             fail(f"--{name.replace('_', '-')} {value} must not be negative")
     return args
 
@@ -646,7 +649,7 @@ def open_run(args: Args) -> Path:
     except OSError as error:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     given, changed = asdict(args), []
-    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # it was begun
+    if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # more than its arguments
         for name, value in json.loads((path / "args.json").read_text()).items():
             if name in given and name not in MAY_DIFFER and value != given[name]:
                 changed.append(f"{name}={value} there, {given[name]} here")

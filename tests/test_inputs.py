@@ -102,7 +102,7 @@ def test_what_the_gpus_physics_cannot_draw(monkeypatch: pytest.MonkeyPatch, caps
         refused((stop.value.code, *capsys.readouterr()), "physx_cuda needs --render-backend sapien_cuda")
         with pytest.raises(SystemExit) as stop:
             module.check_task(module.Args(sim_backend="physx_cuda", render_backend="sapien_cuda", robot_triangles=500))
-        refused((stop.value.code, *capsys.readouterr()), "--robot-triangles 500 must be 0")
+        refused((stop.value.code, *capsys.readouterr()), "physx_cuda needs --robot-triangles 0, not 500")
 
 
 def test_a_folder_that_cannot_be_written() -> None:
@@ -139,6 +139,7 @@ def test_numbers(
     [
         (dict(num_minibatches=21), ["--num-minibatches 21", "at most the 20 steps"]),
         (dict(gamma=1.5, num_minibatches=2), ["--gamma 1.5", "at most 1"]),
+        (dict(eval_every=0), ["--eval-every", "at least 1"]),
         (dict(image_size=32), ["--image-size 32", "at least 36"]),
         (dict(device="cuda"), ["no CUDA device", "--device cpu"]),
     ],
