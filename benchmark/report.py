@@ -32,7 +32,7 @@ RESULTS = ROOT / "benchmark" / "results"
 RUN = ["task", "exp_name", "seed", "commit"]  # what tells one run from another
 METRICS = ["success_once", "success_at_end"]
 COLUMNS = {  # of each file, after RUN and step
-    "eval.csv": [*METRICS, "return"],
+    "eval.csv": [*METRICS, "return", "steps_before"],
     "test.csv": [*METRICS, "return", "nearest_is_right", "swapped_success_once"],
     "beliefs.csv": ["metric", "value"],
 }
@@ -40,7 +40,6 @@ TASKS = ["RememberShapeAndColor3x2-v0", "RememberColor9-v0", "InterceptMedium-v0
 TASKS += ["RememberColor3-v0", "RememberColor5-v0"]
 CHANCE = dict(zip(TASKS, (1 / 6, 1 / 9, None, None, 1 / 3, 1 / 5), strict=True))  # one of the objects is the right one
 FIRST_REPORTED_SEED = 11
-RANDOM_EPISODES = 4000  # of --small, before AIB's and Believer's PPO
 LABELS = {"ppo_aib_small": "AIB", "ppo_believer_small": "Believer", "ppo_baseline_small": "PPO"}
 LABELS |= {"ppo_baseline_equal": "PPO, equal cost", "aib_belief_small": "AIB"}
 for _name, _head in {"none": "no head", "mse": "MSE head", "lambda_0.1": "λ 0.1", "lambda_0.01": "λ 0.01"}.items():
@@ -95,7 +94,10 @@ def collect(folder: Path) -> dict[str, pd.DataFrame]:
         run = {"task": args["env_id"], "exp_name": args["exp_name"], "seed": args["seed"], "commit": commit}
         if (evals := path / "eval.csv").exists():
             found["eval.csv"] += (
-                pd.read_csv(evals).rename(columns={"global_step": "step"}).assign(**run).to_dict("records")
+                pd.read_csv(evals)
+                .rename(columns={"global_step": "step"})
+                .assign(steps_before=steps_before(args, folder), **run)
+                .to_dict("records")
             )
         diagnosis, by_step = read_json(path / "diagnosis.json"), read_json(path / "diagnostics.json")
         if test := read_json(path / "evaluation.json"):
@@ -178,9 +180,13 @@ def name_of(task: str) -> str:
     return task.removesuffix("-v0")
 
 
-def steps_before(task: str, label: str) -> int:
-    """Environment steps before PPO begins: the random episodes of the belief."""
-    return 0 if label.startswith("PPO") else RANDOM_EPISODES * (90 if task.startswith("Intercept") else 60)
+def steps_before(args: dict, runs: Path) -> int:
+    """Environment steps before a run's PPO: the random episodes of its belief, if stage 1's run is in the folder."""
+    if "belief" not in args and "repr_dir" not in args:  # plain PPO
+        return 0
+    preset = "_small" if args.get("small") else ""
+    stage_1 = read_json(runs / f"{args['env_id']}__aib_repr{preset}__{args['seed']}" / "args.json")
+    return stage_1.get("num_episodes", 0) * (90 if args["env_id"].startswith("Intercept") else 60)
 
 
 # ---------------------------------------------------------------- tables
@@ -354,7 +360,7 @@ def learning_figure(evals: pd.DataFrame, path: Path) -> None:
         for name in ("ppo_aib_small", "ppo_believer_small", plain):
             label = LABELS[name].partition(",")[0]
             curves = by_seed(found, "success_once", exp_name=name)
-            curves.index += steps_before(task, label)
+            curves.index += select(found, exp_name=name).steps_before.max() if len(curves) else 0
             draw(ax, curves, label, COLOURS[label])
             for row in select(paper, task=task, method=label).itertuples():
                 dashed = {"linestyle": "--", "linewidth": 1, "label": f"{label}, paper, 10 M steps"}
