@@ -42,8 +42,10 @@ CHANCE = dict(zip(TASKS, (1 / 6, 1 / 9, None, None, 1 / 3, 1 / 5), strict=True))
 FIRST_REPORTED_SEED = 11
 LABELS = {"ppo_aib_small": "AIB", "ppo_believer_small": "Believer", "ppo_baseline_small": "PPO"}
 LABELS |= {"ppo_baseline_equal": "PPO, equal cost", "aib_belief_small": "AIB"}
-for _name, _head in {"none": "no head", "mse": "MSE head", "lambda_0.1": "λ 0.1", "lambda_0.01": "λ 0.01"}.items():
-    LABELS |= {f"{_kind}_small_{_name}": f"AIB, {_head}" for _kind in ("ppo_aib", "aib_belief")}
+LABELS |= {"ppo_aib_small_none": "AIB, no head", "aib_belief_small_none": "AIB, no head"}
+LABELS |= {"ppo_aib_small_mse": "AIB, MSE head", "aib_belief_small_mse": "AIB, MSE head"}
+LABELS |= {"ppo_aib_small_lambda_0.1": "AIB, λ 0.1", "aib_belief_small_lambda_0.1": "AIB, λ 0.1"}
+LABELS |= {"ppo_aib_small_lambda_0.01": "AIB, λ 0.01", "aib_belief_small_lambda_0.01": "AIB, λ 0.01"}
 COLOURS = {"AIB": "tab:blue", "Believer": "tab:orange", "PPO": "tab:gray", "PPO, equal cost": "tab:gray"}
 PROBES = {"u_r2_prior": "last step", "cue_chance": "chance of the cue", "cue_from_u": "cue from u"}
 PROBES |= {"cue_from_h": "cue from h", "cue_from_particle": "cue from particles", "action_readout": "R² of a_t"}
@@ -108,8 +110,8 @@ def collect(folder: Path) -> dict[str, pd.DataFrame]:
             by_step["u_r2_agent"] = {int(step): value for step, value in diagnosis["u_r2"].items()}
         for metric, values in by_step.items():
             if isinstance(values, list):
-                shown = sorted({*range(0, len(values), 5), 4, 9, len(values) - 1} & {*range(len(values))})
-                values = {step: values[step] for step in shown}
+                steps = sorted({*range(0, len(values), 5), 4, 9, len(values) - 1} & {*range(len(values))})
+                values = {step: values[step] for step in steps}
             for step, value in values.items() if isinstance(values, dict) else [(None, values)]:
                 found["beliefs.csv"].append({**run, "step": step, "metric": metric, "value": value})
     tables = {}
@@ -360,7 +362,8 @@ def learning_figure(evals: pd.DataFrame, path: Path) -> None:
         for name in ("ppo_aib_small", "ppo_believer_small", plain):
             label = LABELS[name].partition(",")[0]
             curves = by_seed(found, "success_once", exp_name=name)
-            curves.index += select(found, exp_name=name).steps_before.max() if len(curves) else 0
+            if not curves.empty:
+                curves.index += select(found, exp_name=name).steps_before.max()
             draw(ax, curves, label, COLOURS[label])
             for row in select(paper, task=task, method=label).itertuples():
                 dashed = {"linestyle": "--", "linewidth": 1, "label": f"{label}, paper, 10 M steps"}

@@ -77,6 +77,11 @@ def test_runs_are_added_to_the_results_and_tabled(tmp_path: Path, monkeypatch: p
             (path / "evaluation.json").write_text(json.dumps(test))
     (path / "diagnosis.json").write_text('{"nearest_is_right": 0.75, "u_r2": {"0": 1.0, "5": 0.5}}')
     (path / "diagnosis_swapped.json").write_text('{"success_once": 0.125}')
+    stage_1 = runs / f"{TASK}__aib_repr_small__13"
+    stage_1.mkdir()
+    (stage_1 / "args.json").write_text('{"num_episodes": 100, "quick": true}')
+    for wanted, more in ((6000, {"belief": None, "small": True}), (0, {"belief": None}), (0, {"small": True})):
+        assert report.steps_before({"env_id": TASK, "seed": 13, **more}, runs) == wanted, "episodes of 60 steps"
     monkeypatch.setattr(report, "RESULTS", tmp_path)
     (tmp_path / "paper.csv").write_text((ROOT / "benchmark" / "results" / "paper.csv").read_text())
     for name, columns in report.COLUMNS.items():
