@@ -117,7 +117,9 @@ def collect(folder: Path) -> dict[str, pd.DataFrame]:
     tables = {}
     for name, rows in found.items():
         rows = pd.DataFrame(rows).reindex(columns=[*RUN, "step", *COLUMNS[name]])
-        tables[name] = rows.astype({"seed": "Int64", "step": "Int64"})
+        whole = {"seed", "step", "steps_before"} & {*rows}
+        real = {*COLUMNS[name]} - whole - {"metric"}
+        tables[name] = rows.astype(dict.fromkeys(whole, "Int64") | dict.fromkeys(real, float))
     return tables
 
 
@@ -127,7 +129,9 @@ def add_to_results(runs: Path) -> None:
         if "" in {*rows.commit}:
             fail(f"{runs} lies in no git repository, so the commit of its code is unknown")
         key = [*RUN, "step", *(["metric"] if name == "beliefs.csv" else [])]
-        rows = pd.concat([read(name), rows]).drop_duplicates(key, keep="last")
+        rows = pd.concat([read(name), rows])
+        rows["place"] = rows.groupby(key, sort=False, dropna=False).ngroup()  # a row that is replaced keeps its own
+        rows = rows.drop_duplicates("place", keep="last").sort_values("place").drop(columns="place")
         rows.to_csv(RESULTS / name, index=False, float_format=f"%.{3 if name == 'beliefs.csv' else 4}f")
 
 
@@ -144,7 +148,7 @@ def shown(rows: pd.DataFrame) -> pd.DataFrame:
     parts = [rows[:0]]
     for _, found in rows.groupby("task", sort=False):
         reported = found[found.seed >= FIRST_REPORTED_SEED]
-        parts.append(found[found.commit == found.commit.iloc[-1]] if reported.empty else reported)
+        parts.append(found[found.commit == found.commit.unique()[-1]] if reported.empty else reported)
     return pd.concat(parts)
 
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -92,6 +93,11 @@ def test_runs_are_added_to_the_results_and_tabled(tmp_path: Path, monkeypatch: p
         subprocess.run(["git", "-C", str(tmp_path), *command], check=True)
     report.main(report.Args(runs=runs, add=True))
     report.main(report.Args(runs=runs, add=True))  # a second time in place of the first
+    before = (tmp_path / "eval.csv").read_text()
+    first = tmp_path / "first" / f"{TASK}__ppo_aib_small__1"
+    shutil.copytree(runs / first.name, first)
+    report.main(report.Args(runs=first.parent, add=True))
+    assert (tmp_path / "eval.csv").read_text() == before, "older runs stay before newer ones"
     commit = subprocess.run(["git", "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True, cwd=runs).stdout
     tests, beliefs = (tmp_path / "test.csv").read_text().splitlines(), report.read("beliefs.csv")
     run = f"{TASK},ppo_believer_small,13,{commit.strip()},"
