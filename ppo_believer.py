@@ -296,15 +296,15 @@ class ImageEncoder(nn.Module):
             lines = [torch.linspace(-1, 1, length // size) for length in (height, width)]
             self.register_buffer(name, torch.cartesian_prod(*lines))
         self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
-        self.token_heads = nn.Linear(64, KEY_DIM + 8 + 32)
+        self.token_heads = nn.Linear(64, KEY_DIM + 8)
         self.point = orthogonal_init(mlp([3 * self.block**2, 32, KEY_DIM]))
         self.point_queries = nn.Parameter(torch.randn(8, KEY_DIM))
 
     def forward(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
         """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
 
-        Contents are coordinates and values; the summary is (B, 32). mask, in training: share of the blocks of 2 x 2
-        pixels that are replaced by the mean for all but the keypoints.
+        Contents are coordinates and values; the summary is the patches' maximum (B, 64). mask, in training: share of
+        the blocks of 2 x 2 pixels that are replaced by the mean for all but the keypoints.
         """
         images = rgb.float().sub_(self.mean).div_(self.std)
         keypoints, _ = attend(self.point_queries, self.point(self.cut(images, self.block)), self.block_coordinates)
@@ -314,9 +314,9 @@ class ImageEncoder(nn.Module):
             kept = kept.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, :height, :width]
             images = images * kept.unsqueeze(-1)
         tokens = self.token(self.cut(images, self.patch))
-        keys, values, features = self.token_heads(tokens).split([KEY_DIM, 8, 32], -1)
+        keys, values = self.token_heads(tokens).split([KEY_DIM, 8], -1)
         contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
-        return keys, contents, keypoints.flatten(1), features.relu().amax(1)
+        return keys, contents, keypoints.flatten(1), tokens.amax(1)
 
     def cut(self, images: Tensor, size: int) -> Tensor:
         """Images (B, H, W, 3) -> N patches (B, N, 3 size^2); a linear layer on them is a convolution of that stride."""
@@ -350,7 +350,7 @@ class HistoryEncoder(nn.Module):
         self.arm = nn.Linear(config["joints_dim"], 256)
         nn.init.zeros_(self.arm.weight)  # joints identify an episode: let the rest learn first
         nn.init.zeros_(self.arm.bias)
-        self.gru = nn.GRUCell(64 + 32, 256)
+        self.gru = nn.GRUCell(64 + 64, 256)
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
         """Memory (..., 32), of which the first KEY_DIM ask -> place (..., 10), log weights of the patches (..., N)."""

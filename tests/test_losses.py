@@ -276,7 +276,7 @@ def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
     rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255  # a patch is 2 x 2 pixels here
     keys, contents, keypoints, summary = history.image(rgb)
     assert keys.shape == (2, 18**2, 16) and contents.shape == (2, 18**2, 10)
-    assert keypoints.shape == (2, 8 * 2) and summary.shape == (2, 32)
+    assert keypoints.shape == (2, 8 * 2) and summary.shape == (2, 64)
     patches = [2 * 18 + 5, 15 * 18 + 10]
     assert torch.allclose(keys[0, patches[0]], keys[1, patches[1]]), "a key holds no coordinates"
     assert torch.allclose(keys[0, 0], keys[1, 99]) and not torch.allclose(keys[0, 0], keys[0, patches[0]])
