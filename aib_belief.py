@@ -632,7 +632,7 @@ def main(args: Args) -> None:
         writer.add_scalar("belief/held_out_u_r2_by_step", r_squared(u[t], estimate[t]), t)
     writer.close()
     # the last weights: the error on held-out episodes is lowest before h has learnt the cue
-    content = {**asdict(args), "config": config}
+    content = {"script": "aib_belief", **asdict(args), "config": config}
     content |= {name: stored[name] for name in ("robot_triangles", "image_size")}
     save(path / "belief.pt", {**content, "belief": model["belief"].state_dict()})
     print(f"{path / 'belief.pt'}, at the last step of held-out episodes: R2 of u {r_squared(u[-1], estimate[-1]):.2f}")
@@ -676,7 +676,7 @@ def open_run(args: Args) -> Path:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     given, changed = asdict(args), []
     if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # more than its arguments
-        for name, value in json.loads((path / "args.json").read_text()).items():
+        for name, value in load(path / "args.json").items():
             if name in given and name not in MAY_DIFFER and value != given[name]:
                 changed.append(f"{name}={value} there, {given[name]} here")
     if changed:
@@ -702,10 +702,13 @@ def save(path: Path, content: dict | bytes) -> None:
 
 
 def load(path: Path, **expected: object) -> dict:
-    """Read a .pt file that save wrote; fails where it is missing, or made for another task or picture (expected)."""
+    """Read a .pt or .json file that save wrote; fails where it is missing, damaged, or other than expected."""
     if not path.exists():
         fail(f"{path} does not exist; run the script that writes it first, or correct the path")
-    content = torch.load(path, map_location="cpu", weights_only=True)
+    try:
+        content = torch.load(path, map_location="cpu") if path.suffix == ".pt" else json.loads(path.read_text())
+    except (EOFError, RuntimeError, ValueError):
+        fail(f"{path} is damaged; copy it anew, or delete what the run wrote and start it again")
     for name, value in expected.items():
         if content.get(name) != value:
             fail(f"{path} has {name} {content.get(name)}, this run needs {value}")

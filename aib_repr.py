@@ -261,7 +261,7 @@ def collect_random_episodes(args: Args, path: Path) -> dict[str, np.ndarray]:
     """
     meta, arrays = {**asdict(args), "episodes_done": 0}, {}
     if (path / "meta.json").exists():
-        meta = json.loads((path / "meta.json").read_text())
+        meta = load(path / "meta.json")
         arrays = {file.stem: np.load(file, mmap_mode="r+") for file in path.glob("*.npy")}
     if meta["episodes_done"] == args.num_episodes:
         return arrays
@@ -335,10 +335,9 @@ def main(args: Args) -> None:
         return
     meta = path / "dataset" / "meta.json"
     if meta.exists():  # dataset/ may be a copy from another run
-        found = json.loads(meta.read_text())
-        for name in ("env_id", "robot_triangles", "image_size", "num_episodes"):
-            if found[name] != getattr(args, name):
-                fail(f"{meta.parent} has {name} {found[name]}, this run needs {getattr(args, name)}")
+        load(
+            meta, **{name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
+        )
     arrays = collect_random_episodes(args, path / "dataset")
     transitions = TransitionDataset(path / "dataset", args.device)
     num_val = max(4, args.num_episodes // 10)  # held out from stages 1 and 2: the last ones
@@ -585,7 +584,7 @@ def open_run(args: Args) -> Path:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     given, changed = asdict(args), []
     if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # more than its arguments
-        for name, value in json.loads((path / "args.json").read_text()).items():
+        for name, value in load(path / "args.json").items():
             if name in given and name not in MAY_DIFFER and value != given[name]:
                 changed.append(f"{name}={value} there, {given[name]} here")
     if changed:
@@ -611,10 +610,13 @@ def save(path: Path, content: dict | bytes) -> None:
 
 
 def load(path: Path, **expected: object) -> dict:
-    """Read a .pt file that save wrote; fails where it is missing, or made for another task or picture (expected)."""
+    """Read a .pt or .json file that save wrote; fails where it is missing, damaged, or other than expected."""
     if not path.exists():
         fail(f"{path} does not exist; run the script that writes it first, or correct the path")
-    content = torch.load(path, map_location="cpu", weights_only=True)
+    try:
+        content = torch.load(path, map_location="cpu") if path.suffix == ".pt" else json.loads(path.read_text())
+    except (EOFError, RuntimeError, ValueError):
+        fail(f"{path} is damaged; copy it anew, or delete what the run wrote and start it again")
     for name, value in expected.items():
         if content.get(name) != value:
             fail(f"{path} has {name} {content.get(name)}, this run needs {value}")

@@ -859,7 +859,7 @@ def train_belief(args: Args, path: Path) -> None:
             save(path / "belief_checkpoint.pt", checkpoint)
 
     # no early stopping: held-out error is best before h holds the cue
-    content = {**asdict(args), "config": config, "belief": model["belief"].state_dict()}
+    content = {"script": "ppo_believer", **asdict(args), "config": config, "belief": model["belief"].state_dict()}
     save(path / "belief.pt", content)
     u, estimate = validate_belief(model["belief"], episodes, held_out)
     for t in range(len(u)):
@@ -914,7 +914,7 @@ def main(args: Args) -> None:
     if not args.belief and not file.exists():
         train_belief(args, path)
         torch.cuda.empty_cache()  # the simulator needs the GPU's memory too
-    stored = load(file, **task)
+    stored = load(file, script="ppo_believer", **task)
 
     envs = make_envs(args)
     torch.manual_seed(args.seed)
@@ -1182,7 +1182,7 @@ def open_run(args: Args) -> Path:
         fail(f"{path} is another process's or cannot be written ({error.strerror}); wait or choose another --exp-name")
     given, changed = asdict(args), []
     if (path / "args.json").exists() and len(list(path.iterdir())) > 1:  # more than its arguments
-        for name, value in json.loads((path / "args.json").read_text()).items():
+        for name, value in load(path / "args.json").items():
             if name in given and name not in MAY_DIFFER and value != given[name]:
                 changed.append(f"{name}={value} there, {given[name]} here")
     if changed:
@@ -1208,10 +1208,13 @@ def save(path: Path, content: dict | bytes) -> None:
 
 
 def load(path: Path, **expected: object) -> dict:
-    """Read a .pt file that save wrote; fails where it is missing, or made for another task or picture (expected)."""
+    """Read a .pt or .json file that save wrote; fails where it is missing, damaged, or other than expected."""
     if not path.exists():
         fail(f"{path} does not exist; run the script that writes it first, or correct the path")
-    content = torch.load(path, map_location="cpu", weights_only=True)
+    try:
+        content = torch.load(path, map_location="cpu") if path.suffix == ".pt" else json.loads(path.read_text())
+    except (EOFError, RuntimeError, ValueError):
+        fail(f"{path} is damaged; copy it anew, or delete what the run wrote and start it again")
     for name, value in expected.items():
         if content.get(name) != value:
             fail(f"{path} has {name} {content.get(name)}, this run needs {value}")

@@ -173,10 +173,6 @@ def cut(path: Path) -> Callable[[], object]:
     return lambda: path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
 
 
-def write(path: Path, content: bytes) -> Callable[[], object]:
-    return lambda: path.write_bytes(content)
-
-
 def change(path: Path, **values: object) -> Callable[[], object]:
     """Rewrite some entries of a .pt file."""
     return lambda: torch.save({**torch.load(path, weights_only=True), **values}, path)
@@ -215,12 +211,16 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
     "belief.pt of another task": (ppo_aib, PPO, change(BELIEF_PT, env_id="X-v0"), ["has env_id X-v0"]),
     "named belief missing": (ppo_aib, {**PPO, "belief": "no.pt"}, None, ["no.pt does not exist"]),
     "belief.pt of other meshes": (ppo_aib, PPO, change(BELIEF_PT, robot_triangles=0), ["has robot_triangles 0"]),
-    "belief.pt of other pictures": (
-        ppo_believer,
-        {**PPO, "belief": str(BELIEF_PT), "image_size": 64},
-        None,
-        ["has image_size"],
+    "belief.pt of other pictures": (ppo_aib, {**PPO, "belief": str(BELIEF_PT), "image_size": 64}, None, ["image_size"]),
+    "belief.pt of AIB for Believer": (ppo_believer, {**PPO, "belief": str(BELIEF_PT)}, None, ["has script aib_belief"]),
+    "meta.json cut off": (
+        aib_repr,
+        STAGE_1,
+        lambda: (REPR_PT.unlink(), cut(DATA / "meta.json")()),
+        ["meta.json is damaged"],
     ),
+    "args.json cut off": (ppo_baseline, PPO, cut(AGENT.with_name("args.json")), ["args.json is damaged"]),
+    "checkpoint.pt cut off": (ppo_baseline, PPO, cut(CHECKPOINT), ["checkpoint.pt is damaged"]),
     "agent.pt missing": (ppo_baseline, {**ONLY_EVALUATE, "checkpoint": "no.pt"}, None, ["no.pt does not exist"]),
     "agent.pt of another script": (ppo_aib, ONLY_EVALUATE, None, ["has script ppo_baseline", "needs ppo_aib"]),
     "results without a checkpoint": (ppo_baseline, PPO, CHECKPOINT.unlink, ["has results and no checkpoint.pt"]),
