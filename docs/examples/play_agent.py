@@ -2,7 +2,7 @@
 
 Usage:   python docs/examples/play_agent.py --seed 1
          python docs/examples/play_agent.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
-Writes:  episode.mp4, what the agent's camera saw; prints whether the episode succeeded
+Writes:  episode.mp4, what the agent's camera sees, and beside it the scene, in which hidden objects stay visible
 """
 
 import sys
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import imageio.v3 as iio
+import numpy as np
 import torch
 import tyro
 
@@ -33,7 +34,9 @@ def main(checkpoint: Path = AGENT, seed: int = 0) -> None:
     recurrent, succeeded, frames = None, False, []
     for _ in range(gym.spec(args.env_id).max_episode_steps):
         rgb, joints = torch.as_tensor(obs["rgb"]), torch.as_tensor(obs["joints"])
-        frames.append(obs["rgb"][0].repeat(6, 0).repeat(6, 1))  # enlarged
+        (scene,) = envs.call("render_rgb_array")  # ManiSkill's camera for people, (1, 512, 512, 3)
+        rows = np.arange(512) * args.image_size // 512  # enlarges the agent's picture to 512 x 512
+        frames.append(np.concatenate([obs["rgb"][0][rows][:, rows], scene[0].numpy()], 1))
         h, recurrent = agent.belief.history(rgb, joints, recurrent)
         p_u = agent.belief.decode(h, torch.randn(1, args.num_particles, agent.belief.config["z_dim"]))
         dist, _ = agent({"rgb": rgb, "joints": joints, "particles": p_u.sample()})
