@@ -335,9 +335,8 @@ def main(args: Args) -> None:
         return
     meta = path / "dataset" / "meta.json"
     if meta.exists():  # dataset/ may be a copy from another run
-        load(
-            meta, **{name: getattr(args, name) for name in ("env_id", "robot_triangles", "image_size", "num_episodes")}
-        )
+        same = ("env_id", "robot_triangles", "image_size", "num_episodes")
+        load(meta, **{name: getattr(args, name) for name in same})
     arrays = collect_random_episodes(args, path / "dataset")
     transitions = TransitionDataset(path / "dataset", args.device)
     num_val = max(4, args.num_episodes // 10)  # held out from stages 1 and 2: the last ones
