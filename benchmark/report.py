@@ -395,6 +395,25 @@ def belief_figure(beliefs: pd.DataFrame, path: Path) -> None:
     save_figure(figure, axes, path)
 
 
+def swap_figure(tests: pd.DataFrame, path: Path) -> None:
+    """success_once on test episodes with the agent's own particles and, paler, with another episode's."""
+    tests = shown(tests).dropna(subset="swapped_success_once")
+    tasks = [task for task in TASKS if task in {*tests.task}]
+    figure, axes = panels(len(tasks), min(3, len(tasks)))
+    for ax, task in zip(axes.flat, tasks, strict=False):
+        for place, name in enumerate(("ppo_aib_small", "ppo_believer_small")):
+            found, colour = select(tests, task=task, exp_name=name), COLOURS[LABELS[name]]
+            for side, column, alpha in ((-0.2, "success_once", 1.0), (0.2, "swapped_success_once", 0.4)):
+                ax.bar(place + side, found[column].mean(), 0.36, color=colour, alpha=alpha)
+                ax.plot(np.full(len(found), place + side), found[column], ".", color="black")
+        if CHANCE.get(task):
+            ax.axhline(CHANCE[task], color="black", linestyle=":", linewidth=1, label="chance")
+        ax.set_title(name_of(task), fontsize=9)
+        ax.set(ylabel="success_once", xlim=(-0.6, 1.6), ylim=(0, 1.03), axisbelow=True)
+        ax.set_xticks([0, 1], ["AIB", "Believer"])
+    save_figure(figure, axes, path)
+
+
 # ---------------------------------------------------------------- pages
 
 
@@ -410,6 +429,7 @@ def rebuild(output: Path) -> None:
         (output / page).write_text(text)
     learning_figure(evals, output / "benchmark" / "results" / "learning_curves.png")
     belief_figure(beliefs, output / "benchmark" / "results" / "beliefs.png")
+    swap_figure(tests, output / "benchmark" / "results" / "particles.png")
 
 
 def own_runs(evals: pd.DataFrame, task: str) -> str:

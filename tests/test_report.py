@@ -132,7 +132,7 @@ def test_pages_and_figures_are_those_of_the_data(tmp_path: Path) -> None:
     report.rebuild(tmp_path)
     for page in ("README.md", "docs/results.md"):
         assert (tmp_path / page).read_text() == (ROOT / page).read_text(), f"python benchmark/report.py changes {page}"
-    for name in ("learning_curves.png", "beliefs.png"):
+    for name in ("learning_curves.png", "beliefs.png", "particles.png"):
         made, kept = (iio.imread(root / "benchmark" / "results" / name) for root in (tmp_path, ROOT))
         assert np.array_equal(made, kept), f"python benchmark/report.py changes {name}"
 
