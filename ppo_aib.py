@@ -626,10 +626,11 @@ def main(args: Args) -> None:
         buffer["advantages"] = compute_gae(rewards, values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
-        applied = []  # losses of the minibatches that led to an optimizer step
+        logged = []  # losses of each minibatch
         for _ in range(args.update_epochs):
             for mb_inds in torch.randperm(batch_size, device=args.device).tensor_split(args.num_minibatches):
                 losses = ppo_losses(agent, {name: x[mb_inds] for name, x in batch.items()}, args)
+                logged.append({name: x.detach() for name, x in losses.items()})
                 stop = losses["approx_kl"] > args.target_kl
                 if stop:
                     break
@@ -637,15 +638,13 @@ def main(args: Args) -> None:
                 losses["total"].backward()
                 nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm, error_if_nonfinite=True)
                 optimizer.step()
-                applied.append({name: x.detach() for name, x in losses.items()})
             if stop:
                 break
-        logged = applied or [losses]  # if there was no step: the minibatch that ended the update
         for name in losses:
             scalars[f"losses/{name}"] = torch.stack([mb[name] for mb in logged]).mean().item()
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/episodic_return": scalars["train/return"]}
-        scalars |= {"charts/updates": len(applied), "charts/SPS": batch_size / (time.time() - start)}
+        scalars |= {"charts/updates": len(logged) - int(stop), "charts/SPS": batch_size / (time.time() - start)}
         if args.joints_norm:  # update the statistics last: the ratio needs the rollout's
             agent.joints_norm.train()
             agent.joints_norm(batch["joints"])
