@@ -131,8 +131,6 @@ class Args:
     """weight of the entropy bonus"""
     vf_coef: float = 0.5
     """weight of the value loss"""
-    reward_norm: bool = False
-    """divide rewards in training by the running standard deviation of their discounted sums"""
     max_grad_norm: float = 0.5
     """largest norm of the gradient"""
     target_kl: float = 0.05
@@ -145,8 +143,6 @@ class Args:
     """standard deviation of the actions at the start"""
     noise_beta: float = 0.0
     """exponent of the exploration noise's spectrum 1/f**beta: 0 is white, 1 is pink"""
-    joints_norm: bool = False
-    """standardise the policy's joints by their running mean and standard deviation"""
     amp: bool = False
     """image network of the policy in bfloat16"""
     evaluate: bool = False
@@ -171,8 +167,6 @@ SMALL = dict(
     target_kl=0.1,
     init_std=0.3,
     noise_beta=0.7,
-    reward_norm=True,
-    joints_norm=True,
     image_size=64,
     num_eval_episodes=64,
     amp=BFLOAT16,
@@ -425,8 +419,6 @@ class Agent(nn.Module):
         (action_dim,) = envs.single_action_space.shape
         self.belief = belief.requires_grad_(False).eval()  # frozen; W_enc and W_agg learn with actor and critic
         self.cnn = NatureCNN(spaces["rgb"].shape, 256, args.amp)
-        # running mean and std of the joints; not updated without --joints-norm
-        self.joints_norm = nn.BatchNorm1d(spaces["joints"].shape[0], affine=False, momentum=None).eval()
         self.joints = nn.Sequential(nn.Linear(spaces["joints"].shape[0], 128), nn.ReLU())
         self.w_enc = mlp([belief.config["u_dim"], 64, 64])
         self.w_agg = mlp([64, 64, 64])
@@ -438,7 +430,7 @@ class Agent(nn.Module):
     def forward(self, obs: dict[str, Tensor]) -> tuple[Normal, Tensor]:
         """rgb (B, H, W, 3) uint8, joints (B, J), particles (B, n, u_dim) -> Normal over actions (B, A), value (B,)."""
         image = self.cnn(obs["rgb"].float().div_(255))
-        joints = self.joints(self.joints_norm(obs["joints"]))
+        joints = self.joints(obs["joints"])
         belief = self.w_agg(self.w_enc(obs["particles"]).mean(-2))
         x = torch.cat([image, joints, belief], -1)
         mean = torch.tanh(self.actor(x))  # within the box of actions
@@ -922,7 +914,6 @@ def main(args: Args) -> None:
     agent.belief.load_state_dict(stored["belief"])
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     completed, evals = checkpoint.get("iteration", 0), checkpoint.get("evals", [])
-    reward_var = checkpoint.get("reward_var", 0.0)
     if checkpoint:
         agent.load_state_dict(checkpoint["agent"], strict=False)  # without the belief
         optimizer.load_state_dict(checkpoint["optimizer"])
@@ -939,13 +930,8 @@ def main(args: Args) -> None:
         buffer = rollout(envs, agent, args, seeds)
         scalars = {f"train/{name}": value for name, value in success_and_return(buffer).items()}
 
-        values, rewards = buffer.pop("values"), buffer["rewards"]  # values has T+1 steps: not for the batch
-        if args.reward_norm:
-            # discounted sums of the rewards to come are what compute_gae gives for values of 0 and lambda 1
-            sums = compute_gae(rewards, torch.zeros_like(values), args.gamma, 1.0)
-            reward_var += (sums.var().item() - reward_var) / iteration  # the mean of all iterations' variances
-            rewards = rewards / (reward_var + 1e-8) ** 0.5
-        buffer["advantages"] = compute_gae(rewards, values, args.gamma, args.gae_lambda)
+        values = buffer.pop("values")  # has T+1 steps: not for the batch
+        buffer["advantages"] = compute_gae(buffer["rewards"], values, args.gamma, args.gae_lambda)
         buffer["returns"] = buffer["advantages"] + values[:-1]
         batch = {name: x.flatten(0, 1) for name, x in buffer.items()}
         logged = []  # losses of each minibatch
@@ -967,10 +953,6 @@ def main(args: Args) -> None:
         explained = 1 - batch["advantages"].var() / batch["returns"].var()  # 1 - Var(returns - values) / Var(returns)
         scalars |= {"losses/explained_variance": explained.item(), "charts/episodic_return": scalars["train/return"]}
         scalars |= {"charts/updates": len(logged) - int(stop), "charts/SPS": batch_size / (time.time() - start)}
-        if args.joints_norm:  # update the statistics last: the ratio needs the rollout's
-            agent.joints_norm.train()
-            agent.joints_norm(batch["joints"])
-            agent.joints_norm.eval()
         del buffer, batch, losses, logged  # a gigabyte of images, before the evaluation has its own
 
         if iteration % args.eval_every == 0 or iteration == num_iterations:
@@ -990,7 +972,7 @@ def main(args: Args) -> None:
             writer.add_scalar(name, value, global_step)
         writer.flush()
         trained = {name: x for name, x in agent.state_dict().items() if not name.startswith("belief.")}
-        states = {"agent": trained, "optimizer": optimizer.state_dict(), "reward_var": reward_var}
+        states = {"agent": trained, "optimizer": optimizer.state_dict()}
         save(path / "checkpoint.pt", {"iteration": iteration, "evals": evals, **states})
     envs.close()
     for name in ("success_once", "success_at_end", "return"):

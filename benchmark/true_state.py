@@ -86,7 +86,6 @@ class StateAgent(nn.Module):
         self.cnn = orthogonal_init(NatureCNN(image_shape, 256, args.amp)) if args.pictures else nn.Sequential()
         self.phi = phi
         input_dim = 25 + phi(phi.mean).mean.numel() if phi else joints_dim
-        self.joints_norm = nn.BatchNorm1d(joints_dim, affine=False, momentum=None).eval()
         features = 128 if self.cnn else 256 + 128
         self.joints = orthogonal_init(nn.Sequential(nn.Linear(input_dim, features), nn.ReLU()))
         self.actor = orthogonal_init(nn.Sequential(nn.Linear(256 + 128, 512), nn.ReLU(), nn.Linear(512, action_dim)))
@@ -96,7 +95,7 @@ class StateAgent(nn.Module):
 
     def forward(self, obs: dict[str, torch.Tensor]) -> tuple[Normal, torch.Tensor]:
         """Policy over actions (B, A) and value (B,) of joints (B, 25 + D) and rgb (B, H, W, 3) uint8."""
-        x = self.joints_norm(obs["joints"])
+        x = obs["joints"]
         if self.phi:
             x = torch.cat([x[:, :25], self.phi(obs["joints"][:, 25:]).mean], -1)
         x = self.joints(x.clamp(-10, 10))  # a ball that is hit spins at hundreds of deviations

@@ -12,7 +12,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 ROOT = Path(__file__).parent.parent
 PPO = dict(num_envs=8, num_minibatches=4, eval_every=1, num_eval_episodes=4, num_workers=3)
-PPO |= dict(joints_norm=True, reward_norm=True)
 SIZES = {
     "aib_repr": dict(num_episodes=12, epochs=3, batch_size=30, num_workers=2),
     "aib_belief": dict(warmup_updates=2, num_updates=4, batch_episodes=4, prior_nll=1.0),

@@ -541,19 +541,17 @@ def test_belief_aggregator_is_the_papers_formula() -> None:
     agent = ppo_aib.Agent(spaces(IMAGE, 7, A), ppo_aib.AIBBelief(CONFIG), ppo_aib.Args())
     obs = {"rgb": torch.randint(0, 256, (B, *IMAGE), dtype=torch.uint8), "joints": torch.randn(B, 7)}
     particles = torch.randn(B, 30, 4)
-    agent.joints_norm.running_mean.fill_(3.0), agent.joints_norm.running_var.fill_(4.0)
     nn.init.orthogonal_(agent.actor[-1].weight, 3.0)  # else too near 0 to tell tanh from nothing
     policy, value = agent({**obs, "particles": particles})
     assert policy.mean.shape == (B, A) and value.shape == (B,)
     belief = agent.w_agg(torch.stack([agent.w_enc(particles[:, i]) for i in range(30)]).mean(0))
-    image, joints = agent.cnn(obs["rgb"].float() / 255), agent.joints(agent.joints_norm(obs["joints"]))
+    image, joints = agent.cnn(obs["rgb"].float() / 255), agent.joints(obs["joints"])
     x = torch.cat([image, joints, belief], -1)
     assert torch.allclose(policy.mean, torch.tanh(agent.actor(x)), atol=1e-6)
     assert torch.allclose(value, agent.critic(x)[:, 0], atol=1e-6)
     plain = ppo_baseline.Agent(spaces(IMAGE, 7, A), ppo_baseline.Args())
     nn.init.orthogonal_(plain.actor[-1].weight, 3.0)
-    plain.joints_norm.running_mean.fill_(3.0), plain.joints_norm.running_var.fill_(4.0)
-    x = torch.cat([plain.cnn(obs["rgb"].float() / 255), plain.joints(plain.joints_norm(obs["joints"]))], -1)
+    x = torch.cat([plain.cnn(obs["rgb"].float() / 255), plain.joints(obs["joints"])], -1)
     assert torch.allclose(plain(obs)[0].mean, torch.tanh(plain.actor(x)), atol=1e-6)
 
 

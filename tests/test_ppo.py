@@ -73,63 +73,6 @@ def test_particles_are_draws_from_prior_and_decoder(toy_stages: Path) -> None:
         assert torch.allclose(data["particles"][:, :, i], d.mean + d.stddev * u_noise[:10, :, i], atol=1e-4)
 
 
-@pytest.mark.parametrize("script", METHODS)
-def test_joints_are_standardised_by_the_iterations_played_so_far(
-    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
-) -> None:
-    module, played, first_kl = SCRIPTS[script], [], []
-    rollout, ppo_losses = module.rollout, module.ppo_losses
-
-    def noted_rollout(*args: object, deterministic: bool = False) -> dict:
-        data = rollout(*args, deterministic=deterministic)
-        if not deterministic:
-            played.append(data["joints"].flatten(0, 1))
-        return data
-
-    def noted_losses(*args: object) -> dict:
-        losses = ppo_losses(*args)
-        if len(first_kl) < len(played):
-            first_kl.append(losses["approx_kl"].item())
-        return losses
-
-    monkeypatch.setattr(module, "rollout", noted_rollout)
-    monkeypatch.setattr(module, "ppo_losses", noted_losses)
-    path = train(module, **small(module, toy_stages, joints_norm=True))
-    stored = torch.load(path / "agent.pt", weights_only=True)["agent"]
-    mean = torch.stack([joints.mean(0) for joints in played]).mean(0)
-    assert len(played) == 2 and torch.allclose(stored["joints_norm.running_mean"], mean, atol=1e-5)
-    assert max(first_kl) < 1e-6, "statistics change between iterations, not within"
-
-
-@pytest.mark.parametrize("script", METHODS)
-def test_rewards_are_divided_by_the_running_std_of_their_discounted_sums(
-    toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str
-) -> None:
-    module, trained_on, played = SCRIPTS[script], [], []
-    compute_gae, rollout = module.compute_gae, module.rollout
-
-    def noted_gae(rewards: torch.Tensor, values: torch.Tensor, gamma: float, gae_lambda: float) -> torch.Tensor:
-        if gae_lambda < 1:
-            trained_on.append(rewards)
-        return compute_gae(rewards, values, gamma, gae_lambda)
-
-    def noted_rollout(*args: object, deterministic: bool = False) -> dict:
-        data = rollout(*args, deterministic=deterministic)
-        if not deterministic:
-            played.append(data["rewards"])
-        return data
-
-    monkeypatch.setattr(module, "compute_gae", noted_gae)
-    monkeypatch.setattr(module, "rollout", noted_rollout)
-    train(module, **small(module, toy_stages, reward_norm=True, gamma=0.9))
-    variances = []
-    for rewards in played:
-        sums = [sum(0.9 ** (k - t) * rewards[k] for k in range(t, len(rewards))) for t in range(len(rewards))]
-        variances.append(torch.stack(sums).var())
-    assert torch.allclose(trained_on[0], played[0] / variances[0].sqrt(), rtol=1e-4)
-    assert torch.allclose(trained_on[1], played[1] / ((variances[0] + variances[1]) / 2).sqrt(), rtol=1e-4)
-
-
 def test_the_ratio_starts_at_one_because_the_particles_are_kept(toy_stages: Path) -> None:
     agent, data = play(toy_stages)
     batch = {name: x[:10].flatten(0, 1) for name, x in data.items()}
