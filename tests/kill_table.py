@@ -94,6 +94,8 @@ def curves(folder: Path) -> dict[str, list]:
         for tag in events.Tags()["scalars"] if events else ():
             if not tag.startswith("charts/"):
                 found[tag] = [(row.step, repr(row.value)) for row in events.Scalars(tag)]  # nan too is equal to nan
+                if tag.endswith("by_step"):  # of the finished belief, and by time step: a killed run writes it again
+                    found[tag] = sorted({*found[tag]})
     return found
 
 
