@@ -10,6 +10,7 @@ Writes:  benchmark/results/agent.gif
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -23,8 +24,9 @@ from diagnose_agent import load_phi
 import ppo_aib
 
 STEPS = 60
-WIDTH, HEIGHT = 264, 209  # of a picture in the animation
-AGENT_BOX, SCENE_BOX = (8, 14, 56, 52), (110, 170, 330, 344)  # what is shown of 64 x 64 and of 512 x 512 pixels
+WIDTH, HEIGHT = 220, 174  # of a picture in the animation
+AGENT_BOX = np.array([8, 14, 56, 52]) / 64  # left, top, right, bottom of what is shown of the agent's picture
+SCENE_BOX = (110, 170, 330, 344)  # the same of the scene's, in pixels
 PHASES = {0: "1. the cue: remember this colour", 5: "2. nothing to see", 10: "3. nine cubes: go to the one you saw"}
 
 
@@ -79,12 +81,11 @@ def draw(played: list[list[tuple]], t: int, font: ImageFont.FreeTypeFont) -> Ima
     image = Image.new("RGB", ((WIDTH + 8) * len(played) - 8, 2 * HEIGHT + 58), "white")
     text = ImageDraw.Draw(image)
     text.text((4, 4), PHASES[max(first for first in PHASES if first <= t)], "black", font)
-    left, top, right, bottom = SCENE_BOX
     for k, frames in enumerate(played):
         x, (rgb, scene, dots, succeeded) = k * (WIDTH + 8), frames[t]
-        above = Image.fromarray(rgb).crop(AGENT_BOX).resize((WIDTH, HEIGHT), Image.NEAREST)
-        below = Image.fromarray(scene).crop(SCENE_BOX).resize((WIDTH, HEIGHT), Image.LANCZOS)
-        for column, row in (dots - (left, top)) * (WIDTH / (right - left), HEIGHT / (bottom - top)):
+        above = Image.fromarray(rgb).crop(tuple(AGENT_BOX * len(rgb))).resize((WIDTH, HEIGHT), Image.NEAREST)
+        below = Image.fromarray(scene).crop(SCENE_BOX)
+        for column, row in dots - SCENE_BOX[:2]:
             box = (column - 3, row - 3, column + 3, row + 3)
             ImageDraw.Draw(below).ellipse(box, fill="white", outline="black")
         image.paste(above, (x, 26))
@@ -100,14 +101,13 @@ def main(
     checkpoint: Path, repr_dir: Path, episodes: list[int], output: Path = Path("benchmark/results/agent.gif")
 ) -> None:
     """Play the numbered test episodes and draw them."""
-    stored = ppo_aib.load(checkpoint, env_id="RememberColor9-v0", image_size=64)
+    stored = ppo_aib.load(checkpoint, env_id="RememberColor9-v0")
     same = {name: stored[name] for name in ("env_id", "image_size", "robot_triangles", "amp", "num_particles")}
     args = ppo_aib.Args(**same, device="cpu", sim_backend="physx_cpu", render_backend="sapien_cpu", num_envs=1)
-    envs = ppo_aib.make_envs(args)
-    agent = ppo_aib.Agent(envs, ppo_aib.AIBBelief(stored["config"]), args)
-    envs.close()
-    agent.load_state_dict(stored["agent"])
     env, coefficients = ppo_aib.make_task(args, 1), places_of_u(repr_dir)
+    spaces = SimpleNamespace(single_observation_space=env.observation_space, single_action_space=env.action_space)
+    agent = ppo_aib.Agent(spaces, ppo_aib.AIBBelief(stored["config"]), args)
+    agent.load_state_dict(stored["agent"])
     played = [play(env, agent, episode, coefficients) for episode in episodes]
     font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), 15)
     frames = [draw(played, t, font) for t in range(STEPS)]

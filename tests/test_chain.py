@@ -120,6 +120,15 @@ def test_an_agent_plays_in_a_loop_of_ones_own(quick_runs: Path) -> None:
 
 
 @pytest.mark.thorough
+def test_the_animation_shows_every_step(quick_runs: Path, tmp_path: Path) -> None:
+    agent, stage_1 = (quick_runs / f"{TASK}__{name}_quick__1" for name in ("ppo_aib", "aib_repr"))
+    options = ["--checkpoint", str(agent / "agent.pt"), "--repr-dir", str(stage_1), "--episodes", "0"]
+    code, out, err = run("benchmark/animation", *options, "--output", str(tmp_path / "agent.gif"), cwd=tmp_path)
+    assert code == 0, out + err
+    assert len(iio.imread(tmp_path / "agent.gif")) == gym.spec(TASK).max_episode_steps
+
+
+@pytest.mark.thorough
 def test_an_agent_is_diagnosed_and_nothing_else_is_written(
     quick_runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
