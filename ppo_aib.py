@@ -579,8 +579,6 @@ def main(args: Args) -> None:
         print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
     path = open_run(args)
     checkpoint = load(path / "checkpoint.pt") if (path / "checkpoint.pt").exists() else {}
-    if (path / "agent.pt").exists() and not checkpoint:
-        fail(f"{path} has results and no checkpoint.pt to go on from; choose another --exp-name")
     if checkpoint.get("iteration", 0) >= num_iterations:
         print(f"{path} is finished; a larger --total-timesteps continues it")
         return

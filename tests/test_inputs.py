@@ -223,7 +223,6 @@ CASES = {  # name: (script, arguments, damage, words of the sentence)
     "checkpoint.pt cut off": (ppo_baseline, PPO, cut(CHECKPOINT), ["checkpoint.pt is damaged"]),
     "agent.pt missing": (ppo_baseline, {**ONLY_EVALUATE, "checkpoint": "no.pt"}, None, ["no.pt does not exist"]),
     "agent.pt of another script": (ppo_aib, ONLY_EVALUATE, None, ["has script ppo_baseline", "needs ppo_aib"]),
-    "results without a checkpoint": (ppo_baseline, PPO, CHECKPOINT.unlink, ["has results and no checkpoint.pt"]),
     "other arguments": (
         ppo_baseline,
         {**PPO, "gamma": 0.5},
