@@ -46,6 +46,7 @@ KILLS = [  # script, what it was doing, the moment
     ("ppo_aib", "PPO, renaming eval.csv", "os.replace:6"),
     ("ppo_believer", "Believer, its belief", "believer_losses:1"),
     ("ppo_believer", "Believer, PPO update", "ppo_losses:9"),
+    ("ppo_baseline", "plain PPO, writing the first checkpoint, after agent.pt", "torch.save:2"),
     ("ppo_baseline", "plain PPO, second rollout", "env.step:62"),
 ]
 
