@@ -34,7 +34,7 @@ from tqdm import tqdm
 
 CUDA = torch.cuda.is_available()
 VAL_EVERY = 250  # updates of the belief between checkpoints; after the warm-up each comes with a validation
-IMAGE_CHUNK = 4096 if CUDA else 64  # images through the history encoder at a time: what a CPU's cache holds
+IMAGE_CHUNK = 1024 if CUDA else 16  # images through the image encoder at a time: what a CPU's cache holds
 torch.set_float32_matmul_precision("high")  # TF32, where the device has it
 
 
@@ -147,61 +147,78 @@ class StateEncoder(nn.Module):
 KEY_DIM = 16  # of a query, and of the keys that it is compared with
 PLACE_DIM = 2 + 8  # coordinates and values of what a query finds
 MEMORY_DIM = 32  # of which the first KEY_DIM ask
-
-
-def attend(queries: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-    """Queries (..., Q, 16) to N patches (..., N, .) -> expected contents (..., Q, .), log weights (..., Q, N).
-
-    Without the usual 1 / sqrt(16), logits of normalised queries and keys lie in [-16, 16], and softmax can single out
-    one patch of a thousand.
-    """
-    queries, keys = nn.functional.layer_norm(queries, [KEY_DIM]), nn.functional.layer_norm(keys, [KEY_DIM])
-    log_weights = (queries @ keys.transpose(-1, -2)).log_softmax(-1)
-    return log_weights.exp() @ contents, log_weights
+NUM_COLOURS = 16  # of the palette
+KEYPOINTS_DIM = 3 * NUM_COLOURS  # of each colour: row, column, and whether it is there
 
 
 class ImageEncoder(nn.Module):
-    """What can be found in an image: 16 x 16 patches with keys to ask for, keypoints, and a summary.
+    """What can be found in an image: 16 x 16 patches with keys to ask for, and a keypoint for each colour of a palette.
 
-    Keys hold no coordinates, so that layouts of scenes cannot be memorised. Keypoints, as the place of a moving ball,
-    are where constant queries attend to in a grid of 32 x 32 finer blocks (a spatial softmax, Levine et al., 2016).
+    Keys hold no coordinates, so that layouts of scenes cannot be memorised. A keypoint, as the place of a moving ball,
+    is where its colour is: the spatial softmax of Levine et al. (2016) over single pixels, but of a palette's colours
+    in place of learnt features, of which some seeds miss the ball.
     """
 
     def __init__(self, image_shape: list[int]):
         super().__init__()
         height, width, _ = image_shape
-        self.patch, self.block = min(height, width) // 16, min(height, width) // 32  # pixels
+        self.block = max(1, min(height, width) // 64)  # pixels of one colour
+        self.patch = min(height, width) // 16 // self.block * self.block  # pixels
         self.register_buffer("mean", torch.zeros(image_shape))
         self.register_buffer("std", torch.tensor(255.0))
+        self.register_buffer("palette", torch.zeros(NUM_COLOURS, 3))
         for name, size in ("patch_coordinates", self.patch), ("block_coordinates", self.block):
             lines = [torch.linspace(-1, 1, length // size) for length in (height, width)]
             self.register_buffer(name, torch.cartesian_prod(*lines))
-        self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2, 64, 64]), nn.ReLU()))
+        self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2 + NUM_COLOURS, 64, 64]), nn.ReLU()))
         self.token_heads = nn.Linear(64, KEY_DIM + 8)
-        self.point = orthogonal_init(mlp([3 * self.block**2, 32, KEY_DIM]))
-        self.point_queries = nn.Parameter(torch.randn(8, KEY_DIM))
 
-    def forward(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, ...]:
-        """Images (B, H, W, 3) uint8 -> keys (B, N, 16), contents (B, N, 10) of N patches, keypoints (B, 16), summary.
+    def forward(self, rgb: Tensor, mask: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+        """Images (B, H, W, 3) uint8 -> keys (B, N, 16) and contents (B, N, 10) of N patches, keypoints (B, 48).
 
-        Contents are coordinates and values; the summary is the patches' maximum (B, 64). mask, in training: share of
-        the blocks of 2 x 2 pixels that are replaced by the mean for all but the keypoints.
+        Contents are coordinates and values. mask, in training: share of the blocks of 2 x 2 pixels that the patches
+        have replaced by the mean.
         """
-        images = rgb.float().sub_(self.mean).div_(self.std)
-        keypoints, _ = attend(self.point_queries, self.point(self.cut(images, self.block)), self.block_coordinates)
+        likeness = self.likeness(rgb)
+        weights = likeness.flatten(2)
+        places = weights @ self.block_coordinates / weights.sum(-1, keepdim=True)
+        keypoints = torch.cat([places, weights.amax(-1, keepdim=True)], -1).flatten(1)
+        images = (rgb.float() - self.mean) / self.std
         if mask:
             batch, height, width, _ = rgb.shape
             kept = torch.rand(batch, (height + 1) // 2, (width + 1) // 2, device=rgb.device) >= mask
             kept = kept.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, :height, :width]
             images = images * kept.unsqueeze(-1)
-        tokens = self.token(self.cut(images, self.patch))
+        patches = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch).flatten(1, 2).flatten(2)
+        shown = nn.functional.avg_pool2d(likeness, self.patch // self.block).flatten(2).mT
+        # 10: a small object shows its colour in a few pixels of a patch
+        tokens = self.token(torch.cat([patches, 10 * shown], -1))
         keys, values = self.token_heads(tokens).split([KEY_DIM, 8], -1)
         contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
-        return keys, contents, keypoints.flatten(1), tokens.amax(1)
+        return keys, contents, keypoints
 
-    def cut(self, images: Tensor, size: int) -> Tensor:
-        """Images (B, H, W, 3) -> N patches (B, N, 3 size^2); a linear layer on them is a convolution of that stride."""
-        return images.unfold(1, size, size).unfold(2, size, size).flatten(1, 2).flatten(2)
+    def colours(self, rgb: Tensor) -> Tensor:
+        """Images (B, H, W, 3) uint8 -> mean colours of their blocks (B, 3, H / block, W / block)."""
+        return nn.functional.avg_pool2d(rgb.movedim(-1, 1).float(), self.block)
+
+    def likeness(self, rgb: Tensor) -> Tensor:
+        """Images (B, H, W, 3) uint8 -> how like blocks are to colours of the palette (B, 16, H / block, W / block).
+
+        It is exp(-d^2 / 2), with the distance d of two colours in units of 16 levels of 255.
+        """
+        red_green_blue = zip(self.colours(rgb).unbind(1), self.palette.unbind(1), strict=True)
+        squared = sum((of_blocks.unsqueeze(1) - wanted[:, None, None]).square() for of_blocks, wanted in red_green_blue)
+        return (squared / (-2 * 16**2)).clamp(min=-40).exp()  # exp of less is subnormal, which is slow on a CPU
+
+
+def spread_colours(colours: Tensor) -> Tensor:
+    """A palette (NUM_COLOURS, 3): of the colours (M, 3) each the farthest from the mean and from those before."""
+    chosen = [colours.mean(0)]
+    distance = torch.full((len(colours),), math.inf, device=colours.device)
+    for _ in range(NUM_COLOURS):
+        distance = torch.minimum(distance, (colours - chosen[-1]).square().sum(-1))
+        chosen.append(colours[distance.argmax()])
+    return torch.stack(chosen[1:])
 
 
 class HistoryEncoder(nn.Module):
@@ -212,7 +229,7 @@ class HistoryEncoder(nn.Module):
     1. memory = code(state of the GRU before o_t), of which the first half asks.
     2. A query made of that half attends to the patches of o_t, which gives a place: coordinates and values. Where the
        attention is not sure, as the arm hides the object, the place stays the one of the step before.
-    3. h_t = MLP(memory, place, keypoints) + linear(joints). The GRU then gets place, keypoints and summary of o_t.
+    3. h_t = MLP(memory, place, keypoints) + linear(joints). The GRU then gets place and keypoints of o_t.
     Past actions (E.2) are not in the history: the joints at t and t + 1 show a_t anyway.
     """
 
@@ -226,17 +243,23 @@ class HistoryEncoder(nn.Module):
         self.sure = nn.Linear(1, 1)  # of the attention's largest weight w; at first sigmoid(10 w - 4)
         nn.init.constant_(self.sure.weight, 10.0)
         nn.init.constant_(self.sure.bias, -4.0)
-        self.place = orthogonal_init(mlp([PLACE_DIM + 8 * 2, 64, 64]))
+        self.place = orthogonal_init(mlp([PLACE_DIM + KEYPOINTS_DIM, 64, 64]))
         self.out = orthogonal_init(mlp([MEMORY_DIM + 64, 256, 256]))
         self.arm = nn.Linear(config["joints_dim"], 256)
         nn.init.zeros_(self.arm.weight)  # joints identify an episode: let the rest learn first
         nn.init.zeros_(self.arm.bias)
-        self.gru = nn.GRUCell(64 + 64, 256)
+        self.gru = nn.GRUCell(64, 256)
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory (..., 32), of which the first KEY_DIM ask -> place (..., 10), log weights of the patches (..., N)."""
-        place, log_weights = attend(self.query(memory[..., :KEY_DIM]).unsqueeze(-2), keys, contents)
-        return place.squeeze(-2), log_weights.squeeze(-2)
+        """Memory (B, 32), of which the first KEY_DIM ask -> place (B, 10), log weights of the patches (B, N).
+
+        Without the usual 1 / sqrt(16), logits of normalised query and keys lie in [-16, 16], and softmax can single out
+        one patch of hundreds.
+        """
+        query = nn.functional.layer_norm(self.query(memory[:, :KEY_DIM]), [KEY_DIM])
+        keys = nn.functional.layer_norm(keys, [KEY_DIM])
+        log_weights = (keys @ query.unsqueeze(-1)).squeeze(-1).log_softmax(-1)
+        return (log_weights.exp().unsqueeze(-2) @ contents).squeeze(-2), log_weights
 
     def keep(self, place: Tensor, log_weights: Tensor, before: Tensor) -> Tensor:
         """The place (..., 10) as far as the attention, of weights (..., N), is sure of it; else the one before."""
@@ -244,7 +267,7 @@ class HistoryEncoder(nn.Module):
         return before + sure * (place - before)
 
     def step(
-        self, hidden: Tensor, place: Tensor, keys: Tensor, contents: Tensor, keypoints: Tensor, summary: Tensor
+        self, hidden: Tensor, place: Tensor, keys: Tensor, contents: Tensor, keypoints: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """One step of the recurrence: the GRU's state (B, 256) and the place (B, 10) before; what ImageEncoder found.
 
@@ -253,7 +276,7 @@ class HistoryEncoder(nn.Module):
         memory = self.code(hidden)
         place = self.keep(*self.ask(memory, keys, contents), place)
         embedded = self.place(torch.cat([place, keypoints], -1))
-        return memory, embedded, self.gru(torch.cat([embedded, summary], -1), hidden), place
+        return memory, embedded, self.gru(embedded, hidden), place
 
     def combine(self, memory: Tensor, embedded: Tensor, joints: Tensor) -> Tensor:
         """h (..., 256) of memory (..., 32), embedded places (..., 64) and joints (..., J)."""
@@ -303,11 +326,16 @@ class AIBBelief(nn.Module):
 # ---------------------------------------------------------------- losses
 
 
+def encode_images(image: nn.Module, rgb: Tensor, mask: float = 0.0) -> list[Tensor]:
+    """What ImageEncoder finds in images (M, H, W, 3), IMAGE_CHUNK of them at a time."""
+    return [torch.cat(x) for x in zip(*(image(chunk, mask) for chunk in rgb.split(IMAGE_CHUNK)), strict=True)]
+
+
 def encode_history(history: nn.Module, batch: dict[str, Tensor], mask: float = 0.0) -> tuple[Tensor, Tensor]:
     """h (T+1, B, 256) and memory (T+1, B, 32) of whole episodes: rgb (T+1, B, H, W, 3) uint8, joints (T+1, B, J)."""
     num_steps, num_episodes = batch["rgb"].shape[:2]
-    seen = [history.image(rgb, mask) for rgb in batch["rgb"].flatten(0, 1).split(IMAGE_CHUNK)]
-    seen = [torch.cat(x).unflatten(0, (num_steps, num_episodes)) for x in zip(*seen, strict=True)]
+    seen = encode_images(history.image, batch["rgb"].flatten(0, 1), mask)
+    seen = [x.unflatten(0, (num_steps, num_episodes)) for x in seen]
     hidden, place = batch["joints"].new_zeros(num_episodes, 256), batch["joints"].new_zeros(num_episodes, PLACE_DIM)
     memories, embedded = [], []
     for t in range(num_steps):
@@ -388,15 +416,19 @@ class Teacher(nn.Module):
 
 
 class Locator(nn.Module):
-    """What u is if a patch shows the object: contents (..., 10) -> Normal over u (..., u_dim), one std for all."""
+    """What u is if the object is at a place: memory (..., 16), contents (..., 10) -> Normal over u (..., u_dim).
+
+    Of the contents it gets the coordinates alone. One standard deviation for all places.
+    """
 
     def __init__(self, u_dim: int):
         super().__init__()
-        self.mean = orthogonal_init(mlp([PLACE_DIM, 64, u_dim]))
+        self.mean = orthogonal_init(mlp([KEY_DIM + 2, 64, u_dim]))
         self.raw_std = nn.Parameter(torch.zeros(u_dim))
 
-    def forward(self, contents: Tensor) -> Normal:
-        return Normal(self.mean(contents), nn.functional.softplus(self.raw_std) + 0.1, validate_args=False)
+    def forward(self, memory: Tensor, contents: Tensor) -> Normal:
+        mean = self.mean(torch.cat([memory, contents[..., :2]], -1))
+        return Normal(mean, nn.functional.softplus(self.raw_std) + 0.1, validate_args=False)
 
 
 def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
@@ -404,26 +436,27 @@ def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) ->
 
     The teacher's memory, of the privileged state at the episode's start, asks in place of the GRU's (as the first
     phase of Kumar et al., 2021).
-    error: of u decoded with z from the prior, mean of three: of all that is known, of the place, of the keypoints.
+    error: of u decoded with z from the prior, mean of two: of memory and place, of the place alone.
     place: -log sum_i w_i N(u; locator(patch i)) over the attention's weights w_i, which draws it to where u is told.
     locator: error of u from the attended place, which trains the locator's mean.
     """
     belief, history, u = model["belief"], model["belief"].history, batch["u"]
-    keys, contents, keypoints, _ = history.image(batch["rgb"], args.image_mask)
-    memory = model["teacher"](batch["u_0"], batch["t"])
-    memory = nn.functional.pad(memory, (0, MEMORY_DIM - KEY_DIM))  # the half that does not ask is empty
+    keys, contents, keypoints = encode_images(history.image, batch["rgb"], args.image_mask)
+    known = model["teacher"](batch["u_0"], batch["t"])
+    memory = nn.functional.pad(known, (0, MEMORY_DIM - KEY_DIM))  # the half that does not ask is empty
     place, log_weights = history.ask(memory, keys, contents)
     losses = {"error": 0.0}
-    # the teacher's memory tells much of u: without passes that lack it the attention would not learn to look
-    for use_memory, use_place, use_keypoints in ((1, 1, 1), (0, 1, 0), (0, 0, 1)):
-        embedded = history.place(torch.cat([use_place * place, use_keypoints * keypoints], -1))
-        h = history.combine(use_memory * memory, embedded, history.joints_mean)  # joints would identify an episode
+    # the teacher's memory and the keypoints tell much of u: with them alone the attention would not learn to look
+    embedded = history.place(torch.cat([place, torch.zeros_like(keypoints)], -1))
+    for seen_memory in (memory, torch.zeros_like(memory)):
+        h = history.combine(seen_memory, embedded, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
-        losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 3
-    located = model["locator"](contents)
+        losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 2
+    known = known.detach()  # the locator's losses do not teach the teacher
+    located = model["locator"](known.unsqueeze(-2).expand(*contents.shape[:-1], -1), contents)
     # mean detached: else the locator would learn to predict u from every patch, and the attention nothing
     log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
-    losses["locator"] = (model["locator"](place.detach()).mean - u).square().sum(-1).mean()
+    losses["locator"] = (model["locator"](known, place.detach()).mean - u).square().sum(-1).mean()
     losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
     losses["total"] = sum(losses.values())
     return losses
@@ -570,6 +603,9 @@ def main(args: Args) -> None:
     history = model["belief"].history
     chrono_init(history.gru, len(example["actions"]))
     history.image.mean, history.image.std = stored["norm"]["image_mean"], stored["norm"]["image_std"]
+    rng = np.random.default_rng(args.seed)
+    pictures = episodes.frames(rng.choice(train, 64), rng.integers(len(example["rgb"]), size=64))["rgb"].cpu()
+    history.image.palette = spread_colours(history.image.colours(pictures).movedim(1, -1).flatten(0, -2))
     history.joints_mean, history.joints_std = stored["norm"]["joints_mean"], stored["norm"]["joints_std"]
     model.to(args.device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.belief_lr, fused=True)

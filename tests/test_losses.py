@@ -265,8 +265,6 @@ def test_gradients_reach_the_first_frame_and_come_in_chunks_as_well(monkeypatch:
     assert all(torch.allclose(one, other, rtol=1e-4, atol=1e-6) for one, other in zip(*gradients, strict=True))
     history, batch = belief_model()["belief"].history, belief_batch(59)
     images = batch["rgb"].float().requires_grad_()
-    look = history.image.forward
-    monkeypatch.setattr(history.image, "forward", lambda rgb, mask: look(rgb + 0, mask))  # it subtracts in place
     aib_belief.encode_history(history, {**batch, "rgb": images})[0][-1].sum().backward()
     assert images.grad[0].abs().sum() > 0
 
@@ -274,9 +272,8 @@ def test_gradients_reach_the_first_frame_and_come_in_chunks_as_well(monkeypatch:
 def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
     history, rgb = belief_model()["belief"].history, torch.zeros(2, *IMAGE, dtype=torch.uint8)
     rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255  # a patch is 2 x 2 pixels here
-    keys, contents, keypoints, summary = history.image(rgb)
-    assert keys.shape == (2, 18**2, 16) and contents.shape == (2, 18**2, 10)
-    assert keypoints.shape == (2, 8 * 2) and summary.shape == (2, 64)
+    keys, contents, keypoints = history.image(rgb)
+    assert keys.shape == (2, 18**2, 16) and contents.shape == (2, 18**2, 10) and keypoints.shape == (2, 48)
     patches = [2 * 18 + 5, 15 * 18 + 10]
     assert torch.allclose(keys[0, patches[0]], keys[1, patches[1]]), "a key holds no coordinates"
     assert torch.allclose(keys[0, 0], keys[1, 99]) and not torch.allclose(keys[0, 0], keys[0, patches[0]])
@@ -292,22 +289,47 @@ def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
     assert torch.allclose(contents[[0, 1], patches, :2], torch.tensor(row_and_column))
 
 
-def test_keypoints_move_with_what_they_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    history, rgb = belief_model()["belief"].history, torch.zeros(2, *IMAGE, dtype=torch.uint8)
-    rgb[0, 4:6, 10:12, 0] = rgb[1, 30:32, 20:22, 0] = 255
-    with torch.no_grad():
-        images = (rgb.float() - history.image.mean) / history.image.std
-        red = history.image.point(images[0, 4, 10])
-        history.image.point_queries[0] = red - history.image.point(images[0, 0, 0])  # asks for red and not for black
+def test_a_keypoint_is_the_place_of_its_colour_and_whether_it_is_there() -> None:
+    image = belief_model()["belief"].history.image
+    image.palette[3] = torch.tensor([255.0, 0.0, 0.0])
+    image.palette[5] = torch.tensor([0.0, 240.0, 0.0])
+    rgb = torch.full((3, *IMAGE), 128, dtype=torch.uint8)
+    rgb[0, 5, 10] = rgb[1, 30, 21] = torch.tensor([255, 0, 0], dtype=torch.uint8)
+    rgb[:, 8, 9] = torch.tensor([0, 240 + 16, 0]).clamp(max=255).to(torch.uint8)  # nearly that green
+    keypoints = image(rgb, mask=0.9)[2].unflatten(1, (16, 3))  # keypoints see what is masked, too
+    red, green = keypoints[:, 3], keypoints[:, 5]
+    assert torch.allclose(red[:2, :2], torch.tensor([[5.0, 10], [30, 21]]) / 35 * 2 - 1, atol=1e-3)
+    assert torch.allclose(green[:, :2], torch.tensor([8.0, 9]) / 35 * 2 - 1, atol=1e-3)
+    assert red[:2, 2].min() > 0.999 and red[2, 2] < 1e-9 and torch.allclose(red[2, :2], torch.zeros(2), atol=1e-3)
+    assert torch.allclose(green[:, 2], torch.tensor(-((15 / 16) ** 2) / 2).exp())
 
-    def attend(queries: torch.Tensor, keys: torch.Tensor, contents: torch.Tensor) -> tuple[torch.Tensor, None]:
-        queries, keys = nn.functional.layer_norm(queries, [16]), nn.functional.layer_norm(keys, [16])
-        return (50 * queries @ keys.mT).softmax(-1) @ contents, None
 
-    monkeypatch.setattr(aib_belief, "attend", attend)  # sharper
-    places = history.image(rgb, mask=0.9)[2].unflatten(1, (8, 2))[:, 0]  # keypoints see what is masked, too
-    middle = torch.tensor([[4.5, 10.5], [30.5, 20.5]]) / 35 * 2 - 1
-    assert torch.allclose(places, middle, atol=0.02)
+def test_patches_show_how_much_there_is_of_each_colour() -> None:
+    image, seen = aib_belief.ImageEncoder([128, 192, 3]), []
+    assert (image.block, image.patch) == (2, 8), "blocks of 2 x 2 pixels, 4 x 4 of them in a patch"
+    image.palette[7] = torch.tensor([100.0, 50.0, 0.0])
+    rgb = torch.full((1, 128, 192, 3), 255, dtype=torch.uint8)
+    rgb[0, 16:20, 40:46] = torch.tensor([100, 50, 0], dtype=torch.uint8)  # 2 x 3 blocks
+    image.token.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][..., -16:]))
+    image(rgb)
+    assert seen[0].shape == (1, 16 * 24, 16)
+    assert torch.allclose(seen[0][0, 2 * 24 + 5, 7], torch.tensor(10 * 6 / 16)) and seen[0][0, 0, 7] < 1e-9
+
+
+def test_a_palette_has_the_colours_that_differ_most() -> None:
+    colours = torch.tensor([[200.0, 0, 0]] * 90 + [[0, 0, 90.0]] * 9 + [[0, 90.0, 0]])
+    colours = torch.cat([colours, colours[:90] - torch.rand(90, 3)])
+    palette = aib_belief.spread_colours(colours)
+    assert palette.shape == (16, 3)
+    assert sorted(palette[:2].tolist()) == [[0, 0, 90], [0, 90, 0]] and palette[2, 0] > 198
+    assert all((colours == colour).all(-1).any() for colour in palette)
+
+
+def test_the_palette_is_of_the_training_episodes(toy_stages: Path) -> None:
+    rgb = np.load(toy_stages / f"{TOY}__aib_repr__1" / "dataset" / "rgb.npy")[:16].reshape(-1, 3)
+    belief = torch.load(toy_stages / f"{TOY}__aib_belief__1" / "belief.pt", weights_only=True)["belief"]
+    palette = belief["history.image.palette"]
+    assert all((rgb == colour.numpy()).all(-1).any() for colour in palette) and len(palette.unique(dim=0)) > 3
 
 
 def test_a_place_is_kept_while_the_attention_is_not_sure() -> None:
@@ -322,7 +344,9 @@ def test_masks_hide_blocks_of_two_by_two_pixels() -> None:
     rgb = torch.randint(0, 256, (40, 37, 45, 3), dtype=torch.uint8)
     history.image.mean = torch.full((37, 45, 3), 3.5)
     seen = []
-    history.image.token.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].unflatten(2, (3, 4))))
+    history.image.token.register_forward_pre_hook(
+        lambda _, inputs: seen.append(inputs[0][..., :12].unflatten(2, (3, 4)))
+    )
     plain, again, masked = history.image(rgb), history.image(rgb), history.image(rgb, 0.75)
     assert torch.equal(plain[0], again[0]) and not torch.equal(plain[0], masked[0])
     hidden = (seen[2] == 0).flatten(2).all(-1)
@@ -340,22 +364,25 @@ def test_warmup_losses_are_the_closed_forms() -> None:
     history, belief = model["belief"].history, model["belief"]
     u_0 = batch["u_0"]
     standard = (u_0 - u_0.mean(0)) / (u_0.var(0, correction=0) + 0.05**2).sqrt()
-    memory = model["teacher"].net(torch.cat([standard, (batch["t"] + 1).log()[:, None]], -1))
-    keys, contents, keypoints, _ = history.image(batch["rgb"])
+    known = model["teacher"].net(torch.cat([standard, (batch["t"] + 1).log()[:, None]], -1))
+    keys, contents, keypoints = history.image(batch["rgb"])
+    memory = torch.cat([known, torch.zeros(B, 16)], -1)
     place, log_weights = history.ask(memory, keys, contents)
     weights, errors = log_weights.exp(), []
-    memory = torch.cat([memory, torch.zeros(B, 16)], -1)
     torch.manual_seed(3)
-    for parts in ((memory, place, keypoints), (0 * memory, place, 0 * keypoints), (0 * memory, 0 * place, keypoints)):
-        h = history.out(torch.cat([parts[0], history.place(torch.cat(parts[1:], -1))], -1)) + history.arm.bias
+    for seen_memory in (memory, 0 * memory):
+        embedded = history.place(torch.cat([place, 0 * keypoints], -1))
+        h = history.out(torch.cat([seen_memory, embedded], -1)) + history.arm.bias
         p = belief.prior(h)
         decoded = belief.decoder(torch.cat([p.mean + p.stddev * torch.randn(B, 1, 5)[:, 0], h], -1))
         errors.append((decoded.mean - batch["u"]).square().sum(-1).mean())
-    assert torch.allclose(losses["error"], sum(errors) / 3, atol=1e-4)
-    located = model["locator"](contents)
+    assert torch.allclose(losses["error"], sum(errors) / 2, atol=1e-4)
+    located = model["locator"](known[:, None].expand(-1, 18**2, -1), contents)
     density = Normal(located.mean, located.stddev).log_prob(batch["u"][:, None]).sum(-1).exp()
     assert torch.allclose(losses["place"], -(weights * density).sum(-1).log().mean(), atol=1e-4)
-    at_place = model["locator"](place).mean
+    at_place = model["locator"](known, place).mean
+    values_changed = torch.cat([place[:, :2], place[:, 2:] + 1], -1)
+    assert torch.equal(model["locator"](known, values_changed).mean, at_place), "of a place it sees coordinates alone"
     assert torch.allclose(losses["locator"], (at_place - batch["u"]).square().sum(-1).mean(), atol=1e-4)
     assert torch.allclose(losses["total"], losses["error"] + losses["place"] + losses["locator"])
 
@@ -437,6 +464,7 @@ def test_the_belief_starts_from_the_training_episodes_mean_image_and_joints(toy_
 
 def test_both_image_encoders_subtract_the_mean_image_and_start_orthogonal() -> None:
     psi, history = aib_repr.ObservationEncoder(tuple(IMAGE), 7, 4), aib_belief.HistoryEncoder(CONFIG)
+    history.image.palette.fill_(1000.0)  # colours as such are in no picture
     rgb, joints = torch.randint(0, 100, (2, *IMAGE), dtype=torch.uint8), torch.randn(2, 7)
     for encoder, names, encode, layer in (
         (psi, ["image_mean", "image_std"], lambda x: psi(x, joints).mean, psi.cnn.out[0]),
