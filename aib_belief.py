@@ -415,51 +415,26 @@ class Teacher(nn.Module):
         return self.net(torch.cat([self.standardise(u_0), t.log1p().unsqueeze(-1)], -1))
 
 
-class Locator(nn.Module):
-    """What u is if the object is at a place: memory (..., 16), contents (..., 10) -> Normal over u (..., u_dim).
+def warmup_loss(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> Tensor:
+    """How well the history encoder finds what it is asked for, in single frames (B, ...): a squared error, mean ().
 
-    Of the contents it gets the coordinates alone. One standard deviation for all places.
-    """
-
-    def __init__(self, u_dim: int):
-        super().__init__()
-        self.mean = orthogonal_init(mlp([KEY_DIM + 2, 64, u_dim]))
-        self.raw_std = nn.Parameter(torch.zeros(u_dim))
-
-    def forward(self, memory: Tensor, contents: Tensor) -> Normal:
-        mean = self.mean(torch.cat([memory, contents[..., :2]], -1))
-        return Normal(mean, nn.functional.softplus(self.raw_std) + 0.1, validate_args=False)
-
-
-def warmup_losses(model: nn.ModuleDict, batch: dict[str, Tensor], args: Args) -> dict[str, Tensor]:
-    """Teach the history encoder to find what it is asked for, on single frames (B, ...), before there is a memory.
-
-    The teacher's memory, of the privileged state at the episode's start, asks in place of the GRU's (as the first
-    phase of Kumar et al., 2021).
-    error: of u decoded with z from the prior, mean of two: of memory and place, of the place alone.
-    place: -log sum_i w_i N(u; locator(patch i)) over the attention's weights w_i, which draws it to where u is told.
-    locator: error of u from the attended place, which trains the locator's mean.
+    There is no memory in them: the teacher's, of the privileged state at the episode's start, asks in place of the
+    GRU's (as in the first phase of Kumar et al., 2021). The error is that of u, decoded with z from the prior: the mean
+    of two, from memory and place, and from the place alone.
     """
     belief, history, u = model["belief"], model["belief"].history, batch["u"]
     keys, contents, keypoints = encode_images(history.image, batch["rgb"], args.image_mask)
-    known = model["teacher"](batch["u_0"], batch["t"])
-    memory = nn.functional.pad(known, (0, MEMORY_DIM - KEY_DIM))  # the half that does not ask is empty
-    place, log_weights = history.ask(memory, keys, contents)
-    losses = {"error": 0.0}
+    memory = model["teacher"](batch["u_0"], batch["t"])
+    memory = nn.functional.pad(memory, (0, MEMORY_DIM - KEY_DIM))  # the half that does not ask is empty
+    place, _ = history.ask(memory, keys, contents)
     # the teacher's memory and the keypoints tell much of u: with them alone the attention would not learn to look
     embedded = history.place(torch.cat([place, torch.zeros_like(keypoints)], -1))
+    errors = []
     for seen_memory in (memory, torch.zeros_like(memory)):
         h = history.combine(seen_memory, embedded, history.joints_mean)  # joints would identify an episode
         decoded = belief.decode(h, torch.randn(len(h), 1, args.z_dim, device=h.device)).mean.squeeze(-2)
-        losses["error"] = losses["error"] + (decoded - u).square().sum(-1).mean() / 2
-    known = known.detach()  # the locator's losses do not teach the teacher
-    located = model["locator"](known.unsqueeze(-2).expand(*contents.shape[:-1], -1), contents)
-    # mean detached: else the locator would learn to predict u from every patch, and the attention nothing
-    log_p = Normal(located.mean.detach(), located.stddev, validate_args=False).log_prob(u.unsqueeze(-2)).sum(-1)
-    losses["locator"] = (model["locator"](known, place.detach()).mean - u).square().sum(-1).mean()
-    losses["place"] = -(log_weights + log_p).logsumexp(-1).mean()
-    losses["total"] = sum(losses.values())
-    return losses
+        errors.append((decoded - u).square().sum(-1).mean())
+    return sum(errors) / 2
 
 
 @torch.no_grad()
@@ -596,7 +571,7 @@ def main(args: Args) -> None:
     # belief.pt holds the belief alone; all else serves its training
     model["posterior"] = GaussianMLP(stored["u_dim"] + 256, [256, 256], args.z_dim, min_std=0.1)
     if args.warmup_updates:
-        model["teacher"], model["locator"] = Teacher(config["u_dim"]), Locator(config["u_dim"])
+        model["teacher"] = Teacher(config["u_dim"])
     if args.action_head != "none":
         inputs = 2 * args.z_dim + (action_dim + 1 if args.action_head == "flow" else 0)
         model["head"] = mlp([inputs, 256, action_dim])
@@ -638,7 +613,7 @@ def main(args: Args) -> None:
             # early steps more often (density t^(-1/3)), as they show what is to be remembered
             t = (len(example["rgb"]) * rng.random(len(episode)) ** 1.5).astype(int)
             frames = episodes.frames(episode, t)
-            losses = warmup_losses(model, frames, args)
+            losses = {"total": warmup_loss(model, frames, args)}
         else:
             batch = episodes(rng.choice(train, min(args.batch_episodes, len(train)), replace=False))
             if args.warmup_updates:  # else the teacher knows nothing

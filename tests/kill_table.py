@@ -33,7 +33,7 @@ KILLS = [  # script, what it was doing, the moment
     ("aib_repr", "stage 1, in the second epoch", "repr_losses:6"),
     ("aib_repr", "stage 1, held-out losses", "repr_losses:4"),
     ("aib_repr", "renaming a checkpoint", "os.replace:9"),
-    ("aib_belief", "stage 2, first update", "warmup_losses:1"),
+    ("aib_belief", "stage 2, first update", "warmup_loss:1"),
     ("aib_belief", "stage 2, between checkpoints", "belief_losses:2"),
     ("aib_belief", "stage 2, held-out look", "validate_belief:2"),
     ("aib_belief", "writing a checkpoint", "torch.save:2"),

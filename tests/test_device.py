@@ -63,13 +63,13 @@ def test_stage_2(head: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model = nn.ModuleDict({"belief": belief, "posterior": module.GaussianMLP(U + 256, [8], 5, min_std=0.1)})
     if head in ("flow", "mse"):
         model["head"] = module.mlp([10 + (A + 1) * (head == "flow"), 8, A])
-    model["teacher"], model["locator"] = module.Teacher(U), module.Locator(U)
+    model["teacher"] = module.Teacher(U)
     model.to("meta")
     args = module.Args(z_dim=5, warmup_updates=1, prior_nll=1.0)
     if head != "believer":
         args.action_head = head
     frames = {"rgb": images(B), "u": random(B, U), "u_0": random(B, U), "t": random(B)}
-    module.warmup_losses(model, frames, args)["total"].backward()
+    module.warmup_loss(model, frames, args).backward()
     batch = {"rgb": images(T + 1, B), "joints": random(T + 1, B, J), "u": random(T + 1, B, U)}
     batch["actions"] = random(T, B, A)
     if head == "believer":

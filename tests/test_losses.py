@@ -32,7 +32,7 @@ def belief_model(head: str = "flow", config: dict = CONFIG) -> nn.ModuleDict:
     model = nn.ModuleDict({"belief": aib_belief.AIBBelief(config)})
     model["posterior"] = aib_belief.GaussianMLP(config["u_dim"] + 256, [32], config["z_dim"], min_std=0.1)
     model["head"] = aib_belief.mlp([2 * config["z_dim"] + (A + 1) * (head == "flow"), 32, A])
-    model["teacher"], model["locator"] = aib_belief.Teacher(config["u_dim"]), aib_belief.Locator(config["u_dim"])
+    model["teacher"] = aib_belief.Teacher(config["u_dim"])
     model["teacher"].eval()
     nn.init.orthogonal_(model["belief"].history.arm.weight)  # starts at 0
     return model
@@ -354,46 +354,33 @@ def test_masks_hide_blocks_of_two_by_two_pixels() -> None:
     assert hidden.float().mean(0).min() > 0.4, "not the same blocks in all pictures"
 
 
-def test_warmup_losses_are_the_closed_forms() -> None:
+def test_the_warmup_loss_is_the_closed_form() -> None:
     model = belief_model()
     model["teacher"].train()
     batch = {"rgb": belief_batch()["rgb"][0], "u": torch.randn(B, 4), "u_0": torch.randn(B, 4)}
     batch["t"] = torch.arange(B) + 1
     torch.manual_seed(3)
-    losses = aib_belief.warmup_losses(model, batch, losses_args())
+    loss = aib_belief.warmup_loss(model, batch, losses_args())
     history, belief = model["belief"].history, model["belief"]
     u_0 = batch["u_0"]
     standard = (u_0 - u_0.mean(0)) / (u_0.var(0, correction=0) + 0.05**2).sqrt()
-    known = model["teacher"].net(torch.cat([standard, (batch["t"] + 1).log()[:, None]], -1))
-    keys, contents, keypoints = history.image(batch["rgb"])
-    memory = torch.cat([known, torch.zeros(B, 16)], -1)
-    place, log_weights = history.ask(memory, keys, contents)
-    weights, errors = log_weights.exp(), []
+    memory = model["teacher"].net(torch.cat([standard, (batch["t"] + 1).log()[:, None]], -1))
+    memory = torch.cat([memory, torch.zeros(B, 16)], -1)
+    keys, contents, _ = history.image(batch["rgb"])
+    place, _ = history.ask(memory, keys, contents)
+    embedded = history.place(torch.cat([place, torch.zeros(B, 48)], -1))
     torch.manual_seed(3)
+    errors = []
     for seen_memory in (memory, 0 * memory):
-        embedded = history.place(torch.cat([place, 0 * keypoints], -1))
         h = history.out(torch.cat([seen_memory, embedded], -1)) + history.arm.bias
         p = belief.prior(h)
         decoded = belief.decoder(torch.cat([p.mean + p.stddev * torch.randn(B, 1, 5)[:, 0], h], -1))
         errors.append((decoded.mean - batch["u"]).square().sum(-1).mean())
-    assert torch.allclose(losses["error"], sum(errors) / 2, atol=1e-4)
-    located = model["locator"](known[:, None].expand(-1, 18**2, -1), contents)
-    density = Normal(located.mean, located.stddev).log_prob(batch["u"][:, None]).sum(-1).exp()
-    assert torch.allclose(losses["place"], -(weights * density).sum(-1).log().mean(), atol=1e-4)
-    at_place = model["locator"](known, place).mean
-    values_changed = torch.cat([place[:, :2], place[:, 2:] + 1], -1)
-    assert torch.equal(model["locator"](known, values_changed).mean, at_place), "of a place it sees coordinates alone"
-    assert torch.allclose(losses["locator"], (at_place - batch["u"]).square().sum(-1).mean(), atol=1e-4)
-    assert torch.allclose(losses["total"], losses["error"] + losses["place"] + losses["locator"])
-
-    def gradient(loss: str, parameter: torch.Tensor) -> float:
-        grad = torch.autograd.grad(losses[loss], parameter, retain_graph=True, allow_unused=True)[0]
-        return 0.0 if grad is None else grad.abs().sum().item()
-
-    locator = model["locator"].mean[0].weight
-    assert gradient("locator", locator) > 0 and gradient("place", locator) == 0, "fitted at the attended place alone"
-    assert gradient("locator", history.query[0].weight) == 0 and gradient("place", history.query[0].weight) > 0
-    assert gradient("place", model["locator"].raw_std) > 0
+    assert torch.allclose(loss, sum(errors) / 2, atol=1e-4)
+    loss.backward()
+    for learns in (history.image.token[0][0].weight, history.query[0].weight, model["teacher"].net[0].weight):
+        assert learns.grad.abs().sum() > 0
+    assert history.gru.weight_hh.grad is None
 
 
 @pytest.mark.parametrize("script", [aib_belief, ppo_believer])
