@@ -235,14 +235,15 @@ class ImageEncoder(nn.Module):
     def __init__(self, image_shape: list[int]):
         super().__init__()
         height, width, _ = image_shape
-        self.block = max(1, min(height, width) // 64)  # pixels of one colour
-        self.patch = min(height, width) // 16 // self.block * self.block  # pixels
+        self.every = max(1, min(height, width) // 64)  # of the pixels that keypoints look at
+        self.patch = min(height, width) // 16 // self.every * self.every  # pixels
         self.register_buffer("mean", torch.zeros(image_shape))
         self.register_buffer("std", torch.tensor(255.0))
         self.register_buffer("palette", torch.zeros(NUM_COLOURS, 3))
-        for name, size in ("patch_coordinates", self.patch), ("block_coordinates", self.block):
-            lines = [torch.linspace(-1, 1, length // size) for length in (height, width)]
-            self.register_buffer(name, torch.cartesian_prod(*lines))
+        patches = [torch.linspace(-1, 1, length // self.patch) for length in (height, width)]
+        pixels = [torch.linspace(-1, 1, len(range(0, length, self.every))) for length in (height, width)]
+        self.register_buffer("patch_coordinates", torch.cartesian_prod(*patches))
+        self.register_buffer("pixel_coordinates", torch.cartesian_prod(*pixels))
         self.token = orthogonal_init(nn.Sequential(mlp([3 * self.patch**2 + NUM_COLOURS, 64, 64]), nn.ReLU()))
         self.token_heads = nn.Linear(64, KEY_DIM + 8)
 
@@ -254,7 +255,7 @@ class ImageEncoder(nn.Module):
         """
         likeness = self.likeness(rgb)
         weights = likeness.flatten(2)
-        places = weights @ self.block_coordinates / weights.sum(-1, keepdim=True)
+        places = weights @ self.pixel_coordinates / weights.sum(-1, keepdim=True)
         keypoints = torch.cat([places, weights.amax(-1, keepdim=True)], -1).flatten(1)
         images = (rgb.float() - self.mean) / self.std
         if mask:
@@ -263,25 +264,24 @@ class ImageEncoder(nn.Module):
             kept = kept.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, :height, :width]
             images = images * kept.unsqueeze(-1)
         patches = images.unfold(1, self.patch, self.patch).unfold(2, self.patch, self.patch).flatten(1, 2).flatten(2)
-        shown = nn.functional.avg_pool2d(likeness, self.patch // self.block).flatten(2).mT
+        shown = nn.functional.avg_pool2d(likeness, self.patch // self.every).flatten(2).mT
         # 10: a small object shows its colour in a few pixels of a patch
         tokens = self.token(torch.cat([patches, 10 * shown], -1))
         keys, values = self.token_heads(tokens).split([KEY_DIM, 8], -1)
         contents = torch.cat([self.patch_coordinates.expand(len(rgb), -1, -1), values], -1)
         return keys, contents, keypoints
 
-    def colours(self, rgb: Tensor) -> Tensor:
-        """Images (B, H, W, 3) uint8 -> mean colours of their blocks (B, 3, H / block, W / block)."""
-        return nn.functional.avg_pool2d(rgb.movedim(-1, 1).float(), self.block)
-
+    @torch.no_grad()
     def likeness(self, rgb: Tensor) -> Tensor:
-        """Images (B, H, W, 3) uint8 -> how like blocks are to colours of the palette (B, 16, H / block, W / block).
+        """Images (B, H, W, 3) uint8 -> how like every so many pixels are to the palette (B, 16, H / every, W / every).
 
         It is exp(-d^2 / 2), with the distance d of two colours in units of 16 levels of 255.
         """
-        red_green_blue = zip(self.colours(rgb).unbind(1), self.palette.unbind(1), strict=True)
-        squared = sum((of_blocks.unsqueeze(1) - wanted[:, None, None]).square() for of_blocks, wanted in red_green_blue)
-        return (squared / (-2 * 16**2)).clamp(min=-40).exp()  # exp of less is subnormal, which is slow on a CPU
+        colours = rgb[:, :: self.every, :: self.every].movedim(-1, 1).float()
+        # -d^2 / 2 as a 1 x 1 convolution; in place, as large temporary tensors take a CPU longer than the arithmetic
+        x = nn.functional.conv2d(colours, self.palette[:, :, None, None], -self.palette.square().sum(1) / 2)
+        x -= colours.square().sum(1, keepdim=True) / 2
+        return x.div_(16**2).clamp_(min=-40).exp_()  # exp of less is subnormal, which is slow on a CPU
 
 
 class HistoryEncoder(nn.Module):

@@ -306,10 +306,10 @@ def test_a_keypoint_is_the_place_of_its_colour_and_whether_it_is_there() -> None
 
 def test_patches_show_how_much_there_is_of_each_colour() -> None:
     image, seen = aib_belief.ImageEncoder([128, 192, 3]), []
-    assert (image.block, image.patch) == (2, 8), "blocks of 2 x 2 pixels, 4 x 4 of them in a patch"
+    assert (image.every, image.patch) == (2, 8), "4 x 4 of a patch's pixels"
     image.palette[7] = torch.tensor([100.0, 50.0, 0.0])
     rgb = torch.full((1, 128, 192, 3), 255, dtype=torch.uint8)
-    rgb[0, 16:20, 40:46] = torch.tensor([100, 50, 0], dtype=torch.uint8)  # 2 x 3 blocks
+    rgb[0, 16:20, 40:46] = torch.tensor([100, 50, 0], dtype=torch.uint8)  # 2 x 3 of these
     image.token.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][..., -16:]))
     image(rgb)
     assert seen[0].shape == (1, 16 * 24, 16)
