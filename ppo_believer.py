@@ -364,19 +364,19 @@ class HistoryEncoder(nn.Module):
         self.gru = nn.GRUCell(64, 256)
 
     def ask(self, memory: Tensor, keys: Tensor, contents: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory (B, 32), of which the first KEY_DIM ask -> place (B, 10), log weights of the patches (B, N).
+        """Memory (B, 32), of which the first KEY_DIM ask -> place (B, 10), weights of the patches (B, N).
 
         Without the usual 1 / sqrt(16), logits of normalised query and keys lie in [-16, 16], and softmax can single out
         one patch of hundreds.
         """
         query = nn.functional.layer_norm(self.query(memory[:, :KEY_DIM]), [KEY_DIM])
         keys = nn.functional.layer_norm(keys, [KEY_DIM])
-        log_weights = (keys @ query.unsqueeze(-1)).squeeze(-1).log_softmax(-1)
-        return (log_weights.exp().unsqueeze(-2) @ contents).squeeze(-2), log_weights
+        weights = (keys * query.unsqueeze(-2)).sum(-1).softmax(-1)
+        return (weights.unsqueeze(-1) * contents).sum(-2), weights
 
-    def keep(self, place: Tensor, log_weights: Tensor, before: Tensor) -> Tensor:
-        """The place (..., 10) as far as the attention, of weights (..., N), is sure of it; else the one before."""
-        sure = self.sure(log_weights.exp().amax(-1, keepdim=True)).sigmoid()
+    def keep(self, place: Tensor, weights: Tensor, before: Tensor) -> Tensor:
+        """The place (B, 10) as far as the attention, of weights (B, N), is sure of it; else the one before."""
+        sure = self.sure(weights.amax(-1, keepdim=True)).sigmoid()
         return before + sure * (place - before)
 
     def step(

@@ -279,12 +279,11 @@ def test_attention_finds_a_patch_by_its_look_wherever_it_is() -> None:
     assert torch.allclose(keys[0, 0], keys[1, 99]) and not torch.allclose(keys[0, 0], keys[0, patches[0]])
     history.query = nn.Identity()  # the first half of the memory asks for the first picture's patch
     memory = torch.cat([keys[0, patches[0]].expand(2, -1), torch.randn(2, 16)], -1)
-    place, log_weights = history.ask(memory, keys, contents)
-    assert log_weights.argmax(-1).tolist() == patches and torch.allclose(log_weights.exp().sum(-1), torch.ones(2))
-    query, key = (nn.functional.layer_norm(x, [16]) for x in (memory[:, None, :16], keys))
-    weights = (query * key).sum(-1).softmax(-1)
-    assert torch.allclose(log_weights.exp(), weights, atol=1e-5)
-    assert torch.allclose(place, (weights[..., None] * contents).sum(1), atol=1e-5)
+    place, weights = history.ask(memory, keys, contents)
+    query, key = (nn.functional.layer_norm(x, [16]) for x in (memory[:, :16], keys))
+    assert torch.allclose(weights, torch.einsum("bk,bnk->bn", query, key).softmax(-1), atol=1e-5)
+    assert weights.argmax(-1).tolist() == patches
+    assert torch.allclose(place, torch.einsum("bn,bnc->bc", weights, contents), atol=1e-5)
     row_and_column = [[2 / 17 * 2 - 1, 5 / 17 * 2 - 1], [15 / 17 * 2 - 1, 10 / 17 * 2 - 1]]
     assert torch.allclose(contents[[0, 1], patches, :2], torch.tensor(row_and_column))
 
@@ -335,7 +334,7 @@ def test_the_palette_is_of_the_training_episodes(toy_stages: Path) -> None:
 def test_a_place_is_kept_while_the_attention_is_not_sure() -> None:
     history, before, found = belief_model()["belief"].history, torch.zeros(2, 10), torch.ones(2, 10)
     weights = torch.tensor([[0.9, 0.05, 0.05], [0.05, 0.05, 0.05]])
-    kept = history.keep(found, weights.log(), before)
+    kept = history.keep(found, weights, before)
     assert kept[0].min() > 0.99 and kept[1].max() < 0.05
 
 
