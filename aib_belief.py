@@ -603,6 +603,8 @@ def main(args: Args) -> None:
             progress = (update - 1) / args.warmup_updates
         else:
             progress = (update - args.warmup_updates - 1) / args.num_updates
+            if progress == 0:  # Adam's averages of the warm-up's small gradients would make too large steps
+                optimizer.state.clear()
         # falls to 0 over the second half of each phase, which lowers the error of the last weights
         optimizer.param_groups[0]["lr"] = args.belief_lr * min(1, 2 * (1 - progress))
         if args.warmup_updates:  # after it image encoder and teacher stay as they are: updates are twice as fast
