@@ -113,9 +113,10 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
 
 def test_an_agent_plays_in_a_loop_of_ones_own(quick_runs: Path) -> None:
     agent = quick_runs / f"{TASK}__ppo_aib_quick__1" / "agent.pt"
-    code, out, err = run("docs/examples/play_agent", "--checkpoint", str(agent), cwd=quick_runs.parent)
-    assert code == 0 and f"{TASK}, seed 0: " in out, out + err
-    assert len(iio.imread(quick_runs.parent / "episode.mp4")) == gym.spec(TASK).max_episode_steps
+    for task, options in ((TASK, ["--checkpoint", str(agent)]), ("RememberColor3-v0", [])):
+        code, out, err = run("docs/examples/play_agent", *options, cwd=quick_runs.parent)
+        assert code == 0 and f"{task}, seed 0: " in out, out + err
+        assert len(iio.imread(quick_runs.parent / "episode.mp4")) == gym.spec(task).max_episode_steps
 
 
 @pytest.mark.thorough

@@ -1,6 +1,7 @@
-"""Play an agent of ppo_aib.py in a loop of one's own.
+"""Play an agent of ppo_aib.py in a loop of one's own: by default the one beside this file.
 
-Usage:   python docs/examples/play_agent.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
+Usage:   python docs/examples/play_agent.py --seed 1
+         python docs/examples/play_agent.py --checkpoint runs/RememberColor3-v0__ppo_aib_small__1/agent.pt
 Writes:  episode.mp4, what the agent's camera sees, and beside it the scene, in which hidden objects stay visible
 """
 
@@ -16,9 +17,11 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import ppo_aib
 
+AGENT = Path(__file__).with_name("remember_color3.pt")
+
 
 @torch.no_grad()
-def main(checkpoint: Path, seed: int = 0) -> None:
+def main(checkpoint: Path = AGENT, seed: int = 0) -> None:
     """Play one episode with mean actions."""
     stored = torch.load(checkpoint, map_location="cpu", weights_only=True)
     same = {name: stored[name] for name in ("env_id", "image_size", "robot_triangles", "amp", "num_particles")}
