@@ -273,7 +273,7 @@ class ImageEncoder(nn.Module):
 
     @torch.no_grad()
     def likeness(self, rgb: Tensor) -> Tensor:
-        """Images (B, H, W, 3) uint8 -> how like every so many pixels are to the palette (B, 16, H / every, W / every).
+        """Images (B, H, W, 3) uint8 -> how like their pixels are to each colour (B, 16, H / every, W / every).
 
         It is exp(-d^2 / 2), with the distance d of two colours in units of 16 levels of 255.
         """

@@ -120,7 +120,14 @@ def test_warm_up_then_whole_episodes(
     toy_task: Path, toy_stages: Path, monkeypatch: pytest.MonkeyPatch, script: str, warmup_updates: int
 ) -> None:
     module, rates, order, step = SCRIPTS[script], [], [], torch.optim.Adam.step
-    monkeypatch.setattr(torch.optim.Adam, "step", lambda self: (rates.append(self.param_groups[0]["lr"]), step(self)))
+    fresh = []
+
+    def noted_step(self: torch.optim.Adam) -> None:
+        rates.append(self.param_groups[0]["lr"])
+        fresh.append(not self.state)
+        step(self)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", noted_step)
     warmup_loss, encode_history = module.warmup_loss, module.encode_history
 
     def noted_warmup(model: torch.nn.ModuleDict, frames: dict, args: object) -> torch.Tensor:
@@ -149,6 +156,7 @@ def test_warm_up_then_whole_episodes(
         return
     assert order == ["warm-up"] * 2 + ["hide", "episodes"] * 4
     assert rates[:6] == pytest.approx([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 5e-4]), "falls over the second half"
+    assert fresh[:6] == [True, False, True, False, False, False], "Adam starts anew after the warm-up"
 
 
 @pytest.mark.parametrize(
