@@ -23,7 +23,7 @@ demo: setup
 	echo "stage 1 of 3: 640 random episodes and the state encoder phi, about 6 minutes"
 	$(PY) aib_repr.py $$task --num-episodes 640 --exp-name aib_repr_demo
 	echo "stage 2 of 3: the belief, about 20 minutes"
-	$(PY) aib_belief.py $$task --repr-dir runs/RememberColor3-v0__aib_repr_demo__1 --num-updates 1500 --exp-name aib_belief_demo
+	$(PY) aib_belief.py $$task --repr-dir runs/RememberColor3-v0__aib_repr_demo__1 --exp-name aib_belief_demo
 	echo "stage 3 of 3: PPO on observation and belief, about 30 minutes; curves: .venv/bin/tensorboard --logdir runs"
 	$(PY) ppo_aib.py $$task --belief runs/RememberColor3-v0__aib_belief_demo__1/belief.pt --exp-name ppo_aib_demo --total-timesteps 120000
 	$(PY) benchmark/report.py --runs runs
