@@ -111,14 +111,6 @@ def test_evaluate_alone_plays_its_episodes_with_the_stored_agent(quick_runs: Pat
     assert json.dumps(metrics, indent=2) in out and (path / "evaluation.mp4").stat().st_size > 1000
 
 
-def test_an_agent_plays_in_a_loop_of_ones_own(quick_runs: Path) -> None:
-    agent = quick_runs / f"{TASK}__ppo_aib_quick__1" / "agent.pt"
-    for task, options in ((TASK, ["--checkpoint", str(agent)]), ("RememberColor3-v0", [])):
-        code, out, err = run("docs/examples/play_agent", *options, cwd=quick_runs.parent)
-        assert code == 0 and f"{task}, seed 0: " in out, out + err
-        assert len(iio.imread(quick_runs.parent / "episode.mp4")) == gym.spec(task).max_episode_steps
-
-
 @pytest.mark.thorough
 def test_the_animation_shows_every_step(quick_runs: Path, tmp_path: Path) -> None:
     agent, stage_1 = (quick_runs / f"{TASK}__{name}_quick__1" for name in ("ppo_aib", "aib_repr"))

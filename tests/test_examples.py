@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium as gym
+import imageio.v3 as iio
 import numpy as np
 import pytest
 
@@ -55,6 +56,12 @@ def test_maniskill_task_shows_its_disc_at_first_and_not_later(tmp_path: Path) ->
     assert seen[:, :5].min() > 100 and seen[:, 5:].max() < 10
     assert (episodes["state"][:, :, :2] == episodes["cue"][:, None]).all(), "the hidden disc stays where it was"
     assert np.ptp(episodes["rewards"].mean(1)) > 0.05, "random actions are rewarded differently for different discs"
+
+
+def test_the_stored_agent_plays_in_a_loop_of_ones_own(tmp_path: Path) -> None:
+    code, out, err = run("docs/examples/play_agent", cwd=tmp_path)
+    assert code == 0 and "RememberColor3-v0, seed 0: " in out, out + err
+    assert len(iio.imread(tmp_path / "episode.mp4")) == 60
 
 
 MISTAKES = {  # what a task returns, changed: what check_envs says of it

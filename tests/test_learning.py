@@ -16,9 +16,9 @@ sys.path.append(str(ROOT / "benchmark"))
 import belief as probes  # noqa: E402
 
 REPR = dict(num_episodes=300, epochs=12, batch_size=100, learning_rate=1e-3, num_workers=100)
-BELIEF = dict(num_updates=250, batch_episodes=24, belief_lr=1e-3)
-PPO = dict(total_timesteps=64 * 10 * 16, num_envs=64, learning_rate=1e-3, num_minibatches=8, update_epochs=4)
-PPO |= dict(eval_every=5, num_eval_episodes=192, ent_coef=0.0, num_workers=64)
+BELIEF = dict(num_updates=200, batch_episodes=16, belief_lr=1e-3)
+PPO = dict(total_timesteps=64 * 10 * 12, num_envs=64, learning_rate=1e-3, num_minibatches=8, update_epochs=4)
+PPO |= dict(eval_every=3, num_eval_episodes=192, ent_coef=0.0, num_workers=64)
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (2, 3))])
