@@ -3,7 +3,7 @@
 A recurrent encoder h of the history, a prior p(z|h), a posterior q(z|u,h) and a decoder p(u|z,h) model what the history
 tells about u = phi(s). A flow-matching inverse-dynamics head on (z_t, z_t+1) shapes the posterior; the KL term
 transfers it to the prior, the only one available at deployment. With --warmup-updates the history encoder first
-learns, on single frames, to find what a memory asks for.
+learns, on single frames, to find in a picture the object that is to be remembered.
 
 Usage:   python aib_belief.py --env-id InterceptFast-v0
 Reads:   --repr-dir, by default runs/{env_id}__aib_repr__{seed}/: dataset/ and repr.pt
@@ -52,7 +52,7 @@ class Args:
     device: Literal["cpu", "cuda"] = "cuda" if CUDA else "cpu"
     """where the networks live"""
     small: bool = False
-    """a reduced setting for a CPU: by estimate 3 hours for all stages of RememberColor9-v0 on one core"""
+    """a reduced setting for a CPU: AIB's three stages take by estimate 3 hours on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 
@@ -75,11 +75,11 @@ class Args:
     fm_latent: Literal["mean", "sample"] = "mean"
     """z in L_FM: the mean of q; or a sample of q, which is the paper's choice and mostly noise at first"""
     image_mask: float = 0.25
-    """share of the blocks of 2 x 2 pixels that training hides, against overfitting; 0: as in the paper"""
+    """share of the blocks of 2 x 2 pixels that training hides, against overfitting; 0: none"""
     occlusion: float = 0.5
     """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
     warmup_updates: int = 0
-    """updates on single frames before --num-updates; a teacher that knows the first u is the memory; 0: as the paper"""
+    """updates on single frames before --num-updates, with a teacher in place of the memory; 0: none, as in the paper"""
     prior_nll: float = 0.0
     """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
 

@@ -1,7 +1,7 @@
 """AIB stage 1: a random-policy dataset and a compact encoder of the privileged state (paper section 3.1, Algorithm 1).
 
-phi(s) is trained with psi(o) to predict reward and next latents. The KL penalty keeps in u = phi(s) only what helps
-prediction and o does not show. Saved: phi and the statistics of images and joints.
+The encoder phi turns the privileged state s into a short code u. Together with psi, an encoder of the observation o, it
+learns to predict the reward and the next codes. A KL penalty removes from u what does not help, or what o shows anyway.
 
 Usage:   python aib_repr.py --env-id InterceptFast-v0
 Writes:  runs/{env_id}__{exp_name}__{seed}/: dataset/, repr.pt, TensorBoard events; args.json and checkpoint.pt to
@@ -65,13 +65,13 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot_triangles: int = 0 if CUDA else 500
-    """triangles of each robot mesh, about; with 500 a CPU steps 5 to 10 times as fast; 0, as physx_cuda needs: all"""
+    """draw each robot mesh with about as many triangles; 500: a CPU is 5 to 10 times as fast; 0: all, for physx_cuda"""
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else min(16, 2 * len(os.sched_getaffinity(0)))
-    """simulator processes on physx_cpu, each 0.7 GB of memory; results depend on it by float rounding only"""
+    """simulator processes on physx_cpu, each 0.7 GB of memory; another number changes episodes by rounding"""
     small: bool = False
-    """a reduced setting for a CPU: by estimate 3 hours for all stages of RememberColor9-v0 on one core"""
+    """a reduced setting for a CPU: AIB's three stages take by estimate 3 hours on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 

@@ -1,4 +1,4 @@
-"""The Believer baseline after stage 1 (Wang et al., 2023): a belief with a fixed prior, then PPO on observation and it.
+"""The Believer baseline after stage 1 (Wang et al., 2023): a belief with a fixed prior, then PPO on both.
 
 Where aib_belief.py learns a prior p(z|h) and shapes z by inverse dynamics, Believer draws z from N(0, I) and has no
 action head. Networks, settings, PPO and evaluation are those of aib_belief.py and ppo_aib.py.
@@ -76,13 +76,13 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot_triangles: int = 0 if CUDA else 500
-    """triangles of each robot mesh, about; with 500 a CPU steps 5 to 10 times as fast; 0, as physx_cuda needs: all"""
+    """draw each robot mesh with about as many triangles; 500: a CPU is 5 to 10 times as fast; 0: all, for physx_cuda"""
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else min(16, 2 * len(os.sched_getaffinity(0)))
-    """simulator processes on physx_cpu, each 0.7 GB of memory; results depend on it by float rounding only"""
+    """simulator processes on physx_cpu, each 0.7 GB of memory; another number changes episodes by rounding"""
     small: bool = False
-    """a reduced setting for a CPU: by estimate 3 hours for all stages of RememberColor9-v0 on one core"""
+    """a reduced setting for a CPU: AIB's three stages take by estimate 3 hours on one core"""
     quick: bool = False
     """a trial of a minute whose results mean nothing"""
 
@@ -99,11 +99,11 @@ class Args:
     beta: float = 1.0
     """weight of KL(q || N(0, I))"""
     image_mask: float = 0.25
-    """share of the blocks of 2 x 2 pixels that training hides, against overfitting; 0: as in the paper"""
+    """share of the blocks of 2 x 2 pixels that training hides, against overfitting; 0: none"""
     occlusion: float = 0.5
     """after a warm-up: share of the training episodes in which the object is hidden from a random step on"""
     warmup_updates: int = 0
-    """updates on single frames before --num-updates; a teacher that knows the first u is the memory; 0: as the paper"""
+    """updates on single frames before --num-updates, with a teacher in place of the memory; 0: none, as in the paper"""
     prior_nll: float = 0.0
     """weight of -log p(u|z,h) with z from the prior, which is what the robot has; 0: the paper's loss"""
 
@@ -114,7 +114,7 @@ class Args:
     total_timesteps: int = 10_000_000
     """environment steps of training; a finished run goes on with a larger number"""
     num_envs: int = 256
-    """whole episodes per iteration, each of the task's length; on physx_cuda they begin with one arm pose"""
+    """whole episodes per iteration, each of the task's length; on physx_cuda all begin with the same arm pose"""
     learning_rate: float = 1e-4
     """of Adam, constant"""
     update_epochs: int = 2
@@ -146,7 +146,7 @@ class Args:
     amp: bool = False
     """image network of the policy in bfloat16"""
     evaluate: bool = False
-    """only evaluate --checkpoint; it keeps its task, image_size, robot_triangles, num_envs, amp and particles"""
+    """only evaluate --checkpoint; its task, image_size, robot_triangles, num_envs, amp and particles hold"""
     checkpoint: str | None = None
     """the agent.pt that --evaluate evaluates; by default this run's"""
 
@@ -907,7 +907,7 @@ def main(args: Args) -> None:
     if max(args.gamma, args.gae_lambda) > 1:
         fail(f"--gamma {args.gamma} and --gae-lambda {args.gae_lambda} must be at most 1")
     if args.total_timesteps > 1_000_000 and not CUDA:
-        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes an hour or two", flush=True)
+        print(f"{args.total_timesteps:,} steps take days without CUDA; --small takes hours", flush=True)
     path = open_run(args)
     checkpoint = load(path / "checkpoint.pt") if (path / "checkpoint.pt").exists() else {}
     if checkpoint.get("iteration", 0) >= num_iterations:
