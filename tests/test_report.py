@@ -124,6 +124,8 @@ def test_runs_are_added_to_the_results_and_tabled(tmp_path: Path, monkeypatch: p
     assert f"| Believer | 13 | {commit.strip()} | 2,000 | 0.38 | 0.19 | 0.50 | 0.25 | 0.75 | 0.12 |" in table
     before = report.results_table(tests[tests.seed == 1])
     assert "| 0.40 / 0.20 | 0.50 / 0.25 |  |  | 1 |" in before, "until a block is finished"
+    seeds = pd.DataFrame({"task": "RememberColor9-v0", "seed": [1, 12, 13, 14, 15]})
+    assert [*report.of_blocks(seeds).seed] == [12, 13, 15], "14 has helped to choose the network"
 
 
 def test_pages_and_figures_are_those_of_the_data(tmp_path: Path) -> None:
