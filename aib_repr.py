@@ -65,7 +65,7 @@ class Args:
     render_backend: Literal["sapien_cpu", "sapien_cuda"] = "sapien_cuda" if CUDA else "sapien_cpu"
     """renderer"""
     robot_triangles: int = 0 if CUDA else 500
-    """draw each robot mesh with about as many triangles; 500: a CPU is 5 to 10 times as fast; 0: all, for physx_cuda"""
+    """draw each robot mesh with about as many triangles; 500: a CPU is 8 to 16 times as fast; 0: all, for physx_cuda"""
     image_size: int = 128
     """width and height of the camera's pictures, in pixels, at least 36; MIKASA-Robo's have 128"""
     num_workers: int = 16 if CUDA else min(16, 2 * len(os.sched_getaffinity(0)))
