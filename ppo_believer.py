@@ -1075,8 +1075,8 @@ def decimate_meshes(task: gym.Env, triangles: int) -> None:
         x, y, _ = part.vertices.T
         corners = [axis.argmax() for axis in (-x - y, x - y, y - x, x + y)]
         normals, uv = part.get_vertex_normal()[corners], part.get_vertex_uv()[corners]
-        triangles = np.array([[0, 1, 2], [1, 3, 2]])
-        new.attach(RenderShapeTriangleMesh(part.vertices[corners], triangles, normals, uv, part.material))
+        faces = np.array([[0, 1, 2], [1, 3, 2]])
+        new.attach(RenderShapeTriangleMesh(part.vertices[corners], faces, normals, uv, part.material))
         entity.remove_component(old)
         entity.add_component(new)
 
